@@ -4,10 +4,28 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sdc_taichi.learning.stream import LearnerSpaces, StreamStep
+
+
+def chosen(learner: Any, observation: Tensor) -> list[float]:
+    """Choices or numbers of all players from one observation, (n,), side by side."""
+    seen = observation[None].numpy()
+    return [float(x) for network in learner.networks() for x in network.actions(seen)[0]]
+
+
+def weights(learner: Any) -> list[np.ndarray[Any, Any]]:
+    """Weights and biases of all policies."""
+    return [array for net in learner.networks() for layer in net.layers for array in layer]
+
+
+def assert_same_bits(one: Any, other: Any) -> None:
+    """All policies of two learners are equal to the bit."""
+    for mine, others in zip(weights(one), weights(other), strict=True):
+        np.testing.assert_array_equal(mine, others)
 
 
 class Game:
@@ -35,6 +53,10 @@ class Game:
         self.state_width = self.rooms
         self.room = torch.zeros(self.size, dtype=torch.int64)
         self.turn = 0
+
+    @property
+    def episode_steps(self) -> int:
+        return self.length
 
     @property
     def state(self) -> Tensor:
@@ -80,6 +102,18 @@ class Meeting(Game):
     def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         right = actions == torch.arange(actions.shape[1]) % 3
         return right.float().mean(1), room
+
+
+class Coordination(Game):
+    """The reward of two players is highest where both choose 0, which no player leaves alone.
+
+    Against a player who chooses at random, 2 is better.
+    """
+
+    rewards = torch.tensor([[5.0, -3.0, 4.0], [-3.0, 1.0, 2.0], [4.0, 2.0, 3.0]])
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.rewards[actions[:, 0], actions[:, 1]], room
 
 
 class Patience(Game):

@@ -154,27 +154,15 @@ def test_an_interruption_before_the_first_run_is_told(
         (("--controller", "g38", *CASE), "controller 'g38': unknown"),
         (("--controller", "g36", *CASE[:2], "--site", "XX"), "XX"),
         (("--controller", "g36", *CASE, "--objective", "coal"), "objective 'coal'"),
+        (("{runs}/b", *CASE, "--set", "simulation.steps_per_hour=2"), "b: does not fit these data"),
+        (("{runs}/b", *CASE, "--out", "{runs}"), "holds other files (a-0, a-1, b)"),
     ],
 )
-def test_errors_are_one_line(arguments: tuple[str, ...], said: str) -> None:
-    done = call(*arguments)
+def test_errors_are_one_line(arguments: tuple[str, ...], said: str, runs: Path) -> None:
+    done = call(*(text.format(runs=runs) for text in arguments))
     assert done.exit_code == 2, done.output
     assert said in done.stderr
     assert done.stderr.splitlines()[-1].startswith("error: ")
-
-
-def test_policies_that_do_not_fit_are_refused(runs: Path) -> None:
-    done = call(runs / "b", *CASE, "--no-optimum", "--set", "simulation.steps_per_hour=2")
-    assert done.exit_code == 2
-    assert f"policy {runs}/b: " in done.stderr
-    assert "15" in done.stderr
-
-
-def test_folders_with_other_files_are_left_alone(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "note.txt").write_text("mine")
-    done = call(runs / "b", *CASE, "--out", tmp_path)
-    assert done.exit_code == 2
-    assert "holds other files (note.txt)" in done.stderr
 
 
 def test_trainings_say_what_they_are_evaluated_in(runs: Path, tmp_path: Path) -> None:

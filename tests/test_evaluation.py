@@ -174,21 +174,6 @@ def test_what_cannot_be_evaluated_is_named(weeks: DataCenterWeeks) -> None:
         prepare(CONFIGS, (3,), days=1)
 
 
-def test_ends_are_valued_exactly_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    tabled: list[Optimum] = []
-
-    def table(optimum: Optimum, *_: Any, **__: Any) -> Optimum:
-        tabled.append(optimum)
-        return optimum
-
-    monkeypatch.setattr(evaluation, "solve", solve)
-    monkeypatch.setattr(evaluation, "with_tabled_ends", table)
-    prepare(CONFIGS[:1], (27,), days=2, exact_ends=True).sim.close()
-    assert tabled == []
-    prepare(CONFIGS[:1], (27,), days=2).sim.close()
-    assert len(tabled) == 1
-
-
 def test_tabled_ends_are_lines_between_bounds(weeks: DataCenterWeeks) -> None:
     assert weeks.optimum is not None
     capacity_kwh = float(weeks.sim.sizing.battery_kwh[1])

@@ -1,4 +1,4 @@
-"""On-policy algorithms: losses, advantages, cases that agree, and games with known answers."""
+"""On-policy algorithms: losses, advantages, special cases that agree, and environments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make test-t
 from torch import Tensor, nn  # noqa: E402
 
 import sdc_taichi  # noqa: E402
-from learning_games import Aim, Game, Meeting, Patience, Rooms, Turnstile  # noqa: E402
+from learning_games import Game, Rooms, Turnstile, assert_same_bits, weights  # noqa: E402
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.learning import on_policy  # noqa: E402
 from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings  # noqa: E402
@@ -61,32 +61,6 @@ def trained(name: str, game: Game, settings: OnPolicySettings = SMALL, **more: i
     for _ in range(more.get("updates", 100)):
         algo.update(game)
     return algo
-
-
-def weights(algo: OnPolicy) -> list[np.ndarray[Any, Any]]:
-    return [array for net in algo.networks() for layer in net.layers for array in layer]
-
-
-def assert_same_bits(one: OnPolicy, other: OnPolicy) -> None:
-    for a, b in zip(weights(one), weights(other), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def scores(algo: OnPolicy, observation: Tensor) -> list[np.ndarray[Any, Any]]:
-    """What the last layer of each policy says of an observation, (k * 3,) or (k,)."""
-    out = []
-    for net in algo.networks():
-        x = np.clip((observation.numpy() - net.mean) / net.std, -net.clip, net.clip)
-        for weight, bias in net.layers[:-1]:
-            x = np.tanh(weight @ x + bias)
-        weight, bias = net.layers[-1]
-        out.append(weight @ x + bias)
-    return out
-
-
-def choices(algo: OnPolicy, observation: Tensor) -> list[int]:
-    """Choices that all policies think best, by learner and number."""
-    return [int(i) for s in scores(algo, observation) for i in s.reshape(-1, 3).argmax(1)]
 
 
 # Losses
@@ -344,28 +318,6 @@ def test_learners_are_updated_in_changing_order() -> None:
     assert len(orders - {()}) > 2
 
 
-@pytest.mark.parametrize("name", ON_POLICY)
-def test_going_on_from_a_state_is_the_same_to_the_bit(name: str) -> None:
-    game, players = Rooms(1 if name == "ppo" else 2), 1 if name == "ppo" else 2
-    algo = algorithm(name, game)
-    for _ in range(3):
-        algo.update(game)
-    kept = copy.deepcopy((algo.state_dict(), game.state_dict()))
-    logged = [algo.update(game) for _ in range(2)]
-    again, same_game = algorithm(name, Rooms(players), seed=9), Rooms(players)
-    again.load_state_dict(kept[0])
-    same_game.load_state_dict(kept[1])
-    assert [again.update(same_game) for _ in range(2)] == logged
-    assert_same_bits(again, algo)
-
-
-def test_seeds_decide_the_bits() -> None:
-    one, same = (trained("happo", Rooms(2), updates=3) for _ in range(2))
-    assert_same_bits(one, same)
-    other = trained("happo", Rooms(2), updates=3, seed=1)
-    assert not np.array_equal(weights(one)[0], weights(other)[0])
-
-
 def test_learning_rate_falls_to_nothing_over_the_training() -> None:
     game = Rooms()
     algo = algorithm("ippo", game, SMALL.model_copy(update={"anneal": True}), updates=4)
@@ -374,34 +326,6 @@ def test_learning_rate_falls_to_nothing_over_the_training() -> None:
         algo.update(game)
     for before, after in zip(last, weights(algo), strict=True):
         np.testing.assert_array_equal(before, after)
-
-
-# Games with known answers
-
-
-@pytest.mark.parametrize("name", ["ippo", "mappo", "happo", "haa2c"])
-def test_players_find_the_one_best_joint_choice(name: str) -> None:
-    game = Meeting(3)
-    assert choices(trained(name, game, QUICK, updates=30), game.state[0]) == [0, 1, 2]
-
-
-def test_one_learner_finds_the_best_of_several_choices_at_once() -> None:
-    game = Meeting(1, width=4)
-    assert choices(trained("ppo", game, QUICK, updates=30), game.state[0]) == [0, 1, 2, 0]
-
-
-@pytest.mark.parametrize("name", ["ppo", "happo"])
-def test_the_choice_that_pays_later_is_learned_where_the_greedy_one_is_wrong(name: str) -> None:
-    found = trained(name, Patience(), QUICK, updates=30)
-    assert choices(found, torch.tensor([1.0, 0.0])) == [2]
-
-
-@pytest.mark.parametrize("name", ["ippo", "happo"])
-def test_numbers_are_learned_that_pay_best(name: str) -> None:
-    game = Aim(2, discrete=False)
-    settings = QUICK.model_copy(update={"anneal": True})
-    found = scores(trained(name, game, settings, updates=80), game.state[0])
-    np.testing.assert_allclose(np.concatenate(found), [0.5, -0.5], atol=0.15)
 
 
 # Environments

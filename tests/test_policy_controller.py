@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,12 +53,11 @@ def run(
     return kept
 
 
-def trained(
-    configs: Sequence[DataCenterConfig], made: Policy, steps: int, **options: Any
-) -> list[StepResult]:
-    """Results of the environments of a policy under its networks, asked by hand."""
-    own = made.interface.options(start="fixed", **options)
-    env = vector_env(config=list(configs), options=own)
+def trained(configs: Sequence[DataCenterConfig], made: Policy, steps: int) -> list[StepResult]:
+    """Results of the environments of a policy, with the actions of its networks."""
+    others = {} if made.about.others == "idle" else {"others": made.about.others}
+    options = made.interface.options(start="fixed", **others)
+    env = vector_env(config=list(configs), options=options)
     observations, _ = env.reset(seed=0)
     kept = []
     for step in range(steps):
@@ -87,32 +85,40 @@ def varied(results: Sequence[StepResult], name: str) -> bool:
     return len(np.unique([getattr(result, name) for result in results])) > 1
 
 
+def joint() -> Policy:
+    """A policy whose only network acts for all agents."""
+    fits = interface()
+    sizes = {f.name: f.size for agent in fits.agents for f in fits.features[agent]}
+    net = network(fits.agents, sum(sizes.values()), 9, seed=5)
+    return Policy((net,), fits, About(algorithm="ppo"))
+
+
+def of_the_battery(others: str = "load=greedy-ci,cooling=g36") -> Policy:
+    made = policy(interface(agents=("agent_bat",)), seed=2)
+    return replace(made, about=About(algorithm="none", others=others))
+
+
 @pytest.mark.parametrize(
-    "options",
+    "made",
     [
-        {},
-        {"actions": "continuous", "setpoint_change_k": 1.0},
-        {"action_order": "sustaindc", "ci_leads_h": (1.0, 2.5)},
-        {"observations": "sustaindc"},
+        policy(interface(), seed=3),
+        policy(interface(actions="continuous", setpoint_change_k=1.0), seed=3),
+        policy(interface(action_order="sustaindc", ci_leads_h=(1.0, 2.5)), seed=3),
+        policy(interface(observations="sustaindc"), seed=3),
+        policy(interface(actions="continuous"), seed=3, levels=5, decision_steps=4),
+        joint(),
+        of_the_battery(),
     ],
+    ids=["discrete", "continuous", "order", "sustaindc", "levels", "joint", "others"],
 )
-def test_a_run_has_the_commands_of_the_training(options: dict[str, Any]) -> None:
+def test_a_run_has_the_commands_of_the_training(made: Policy) -> None:
     configs = fleet_of()
-    made = policy(interface(**options), seed=3)
-    found = run(configs, made, 60)
-    assert_equal(found, trained(configs, made, 60))
-    assert all(varied(found, name) for name in COMMANDS)
-
-
-def test_actions_of_levels_are_held_between_decisions() -> None:
-    configs = fleet_of()
-    made = policy(interface(actions="continuous"), seed=3, levels=5, decision_steps=4)
-    found = run(configs, made, 60)
-    assert_equal(found, trained(configs, made, 60))
-    loads = np.array([result.load_command for result in found])
-    assert set(np.unique(loads)) <= {-1.0, -0.5, 0.0, 0.5, 1.0}
-    assert np.array_equal(loads, np.repeat(loads[::4], 4, axis=0))
-    assert varied(found, "load_command")
+    results = run(configs, made, 60)
+    assert_equal(results, trained(configs, made, 60))
+    loads = np.array([result.load_command for result in results])
+    assert np.array_equal(loads, np.repeat(loads[:: made.decision_steps], made.decision_steps, 0))
+    names = COMMANDS if made.decision_steps == 1 else COMMANDS[:1]
+    assert all(varied(results, name) for name in names)
 
 
 def test_commands_of_several_units_and_fans_are_those_of_the_training() -> None:
@@ -122,31 +128,9 @@ def test_commands_of_several_units_and_fans_are_those_of_the_training() -> None:
         agents=("agent_dc",), actions="continuous", commands={"agent_dc": ("fan", "cooling")}
     )
     made = policy(interface_of(build_fleet(configs), options), seed=3)
-    found = run(configs, made, 12)
-    assert_equal(found, trained(configs, made, 12), ("setpoint_c", "crac_fan_w"))
-    assert varied(found, "crac_fan_w")
-
-
-def test_a_joint_policy_has_the_commands_of_the_training() -> None:
-    configs = fleet_of()
-    fits = interface()
-    names: dict[str, int] = {f.name: f.size for a in fits.agents for f in fits.features[a]}
-    made = Policy(
-        (network(fits.agents, sum(names.values()), 9, seed=5),), fits, About(algorithm="ppo")
-    )
-    found = run(configs, made, 40)
-    assert_equal(found, trained(configs, made, 40))
-    assert all(varied(found, name) for name in COMMANDS)
-
-
-def test_others_act_as_in_training() -> None:
-    configs = fleet_of()
-    made = policy(interface(agents=("agent_bat",)), seed=2)
-    others = "load=greedy-ci,cooling=g36"
-    made = replace(made, about=About(algorithm="none", others=others))
-    found = run(configs, made, 60)
-    assert_equal(found, trained(configs, made, 60, others=others))
-    assert all(varied(found, name) for name in COMMANDS)
+    results = run(configs, made, 12)
+    assert_equal(results, trained(configs, made, 12), ("setpoint_c", "crac_fan_w"))
+    assert varied(results, "crac_fan_w")
 
 
 def test_a_data_center_is_the_same_alone_and_in_a_batch() -> None:
@@ -211,13 +195,10 @@ def test_a_policy_is_a_controller_by_name(tmp_path: Path) -> None:
 
 
 def test_a_policy_may_stand_for_one_agent_beside_others(tmp_path: Path) -> None:
-    made = policy(interface(agents=("agent_bat",)), seed=2)
-    other = replace(made, about=About(algorithm="none", others="load=greedy-ci"))
-    other.save(tmp_path)
+    of_the_battery("load=greedy-ci").save(tmp_path)
     configs = fleet_of()
-    found = run(configs, f"cooling=g36,battery=policy:{tmp_path}", 30)
-    expected = replace(made, about=About(algorithm="none", others="cooling=g36"))
-    assert_equal(found, run(configs, expected, 30))
+    results = run(configs, f"cooling=g36,battery=policy:{tmp_path}", 30)
+    assert_equal(results, run(configs, of_the_battery("cooling=g36"), 30))
 
 
 def test_what_a_policy_cannot_do_is_one_error(tmp_path: Path) -> None:
@@ -230,8 +211,7 @@ def test_what_a_policy_cannot_do_is_one_error(tmp_path: Path) -> None:
     ):
         with pytest.raises(SdcError, match=said):
             make_controller(spec, fleet)
-    made = Policy.load(tmp_path)
-    replace(made, about=About(algorithm="none", others="load=greedy-ci")).save(tmp_path / "others")
+    of_the_battery("load=greedy-ci").save(tmp_path / "others")
     with pytest.raises(SdcError, match="does not act on load; it gives battery"):
         make_controller(f"load=policy:{tmp_path / 'others'}", fleet)
     with pytest.raises(ConfigError, match=r"policy .*does not fit .*step: 15 min in training, 30"):
@@ -242,12 +222,11 @@ def test_what_a_policy_cannot_do_is_one_error(tmp_path: Path) -> None:
 
 def test_a_policy_runs_no_code_that_its_file_names(tmp_path: Path) -> None:
     fleet = build_fleet(load_config("tiny"))
-    made = policy(interface(agents=("agent_bat",)))
-    replace(made, about=About(algorithm="none", others="cProfile:run:1/0")).save(tmp_path)
+    of_the_battery("cProfile:run:1/0").save(tmp_path)
     with pytest.raises(ConfigError, match=r"others of its training: .*code that a file names"):
         make_controller(f"policy:{tmp_path}", fleet)
     assert commands_of(make_controller(f"battery=policy:{tmp_path}", fleet)) == ("battery",)
-    replace(made, about=About(algorithm="none", others=f"policy:{tmp_path}")).save(tmp_path)
+    of_the_battery(f"policy:{tmp_path}").save(tmp_path)
     with pytest.raises(ConfigError, match="its training had this policy for others"):
         make_controller(f"policy:{tmp_path}", fleet)
 
@@ -284,11 +263,3 @@ def test_a_saved_episode_goes_on_under_a_policy() -> None:
     env.load_state_dict(saved)
     assert_equal([env.core.step(hold).result for _ in range(10)], expected)
     env.close()
-
-
-def test_a_copy_has_a_memory_of_its_own() -> None:
-    made = PolicyController(policy(interface()), build_fleet(load_config("tiny")))
-    copied = deepcopy(made)
-    assert copied is not made
-    assert copied.policy is made.policy
-    assert copied.commands == made.commands

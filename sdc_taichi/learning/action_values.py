@@ -14,21 +14,20 @@ from torch import Tensor
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.algorithms import OffPolicySettings
+from sdc_taichi.learning.networks import LAST_GAIN
 from sdc_taichi.learning.policy import CHOICES
 
 MOST_JOINT_ACTIONS = 729
 """Largest number of joint actions that a critic values: those of six choices out of three."""
-LAST_GAIN = 0.01
-"""Gain of the last weights, so that all values begin near 0."""
 
 
 class Perceptrons:
-    """Perceptrons of one shape, E side by side.
+    """E perceptrons of equal shape, evaluated together.
 
     Args:
-        number: how many, E.
-        width: inputs of each.
-        out: outputs of each.
+        number: number of perceptrons, E.
+        width: number of inputs of each.
+        out: number of outputs of each.
         settings: hidden layers and their activation.
         generator: source of the weights, which are orthogonal (Saxe et al. 2014).
 
@@ -61,38 +60,38 @@ class Perceptrons:
 
         Args:
             inputs: (N, width).
-            parameters: weights and biases in place of its own, as those of a target network.
+            parameters: weights and biases to use instead, such as those of a target network.
         """
-        given = self.parameters if parameters is None else parameters
-        x = inputs.expand(len(given[0]), *inputs.shape)
-        for i in range(0, len(given), 2):
+        used = self.parameters if parameters is None else parameters
+        x = inputs.expand(len(used[0]), *inputs.shape)
+        for i in range(0, len(used), 2):
             if i:
                 x = self._activation(x)
-            x = torch.baddbmm(given[i + 1], x, given[i])
+            x = torch.baddbmm(used[i + 1], x, used[i])
         return x
 
 
 class JointValues:
     """Values of all joint actions of K choices in a state, by E critics.
 
-    The output is dueling (Wang et al. 2016), Q = V + A - mean A, and the advantage of a joint
-    action is the sum of one of each choice and one of their combination: A(a) = A_1(a_1) + ... +
-    A_K(a_K) + A_all(a). Any table can be told that way, and what a choice does whatever the others
-    are is learned from every step in which it was made.
+    The output is dueling (Wang et al. 2016), Q = V + A - mean A. The advantage of a joint action is
+    the sum of one term for each choice and one for their combination: A(a) = A_1(a_1) + ... +
+    A_K(a_K) + A_all(a). Any table has this form, and the effect of a choice that does not depend on
+    the other choices is learned from every step in which it was made.
 
     Args:
-        number: how many critics, E.
-        width: entries of a state.
-        choices: how many choices are made in a step, K.
+        number: number of critics, E.
+        width: number of entries of a state.
+        choices: number of choices in a step, K.
         settings: hidden layers and their activation.
         generator: source of the weights.
-        levels: how many possibilities each choice has, L.
+        levels: number of possibilities of each choice, L.
 
     Attributes:
         parameters: weights and biases of the critics.
 
     Raises:
-        ConfigError: more joint actions than a table has.
+        ConfigError: there are more than ``MOST_JOINT_ACTIONS`` joint actions.
     """
 
     def __init__(
@@ -125,7 +124,7 @@ class JointValues:
 
         Args:
             state: (N, width).
-            parameters: of target networks, in place of its own.
+            parameters: weights and biases to use instead, such as those of a target network.
         """
         out = self._nets(state, parameters)
         of_choices = len(self._of_choices)
@@ -140,8 +139,8 @@ class JointValues:
 
         Args:
             state: (N, width).
-            actions: choices of each, (N, K).
-            parameters: of target networks, in place of its own.
+            actions: choices, (N, K).
+            parameters: weights and biases to use instead, such as those of a target network.
         """
         table = self(state, parameters)
         joint = (actions.long() * self._places).sum(-1)
@@ -152,9 +151,9 @@ class ContinuousValues:
     """Values of joint actions of K numbers within -1..1 in a state, by E critics.
 
     Args:
-        number: how many critics, E.
-        width: entries of a state.
-        numbers: how many numbers are decided in a step, K.
+        number: number of critics, E.
+        width: number of entries of a state.
+        numbers: number of actions in a step, K.
         settings: hidden layers and their activation.
         generator: source of the weights.
 
@@ -180,26 +179,26 @@ class ContinuousValues:
 
         Args:
             state: (N, width).
-            actions: numbers of each, (N, K).
-            parameters: of target networks, in place of its own.
+            actions: numbers, (N, K).
+            parameters: weights and biases to use instead, such as those of a target network.
         """
         return self._nets(torch.cat([state, actions], dim=-1), parameters).squeeze(-1)
 
 
-def expected(table: Tensor, probabilities: Tensor, kept: Collection[int] = ()) -> Tensor:
-    """Expected values of joint actions over independent choices.
+def expected(table: Tensor, probabilities: Tensor, free: Collection[int] = ()) -> Tensor:
+    """Expected values of joint actions under independent choices.
 
     Args:
         table: values of all joint actions, (N, L^K).
         probabilities: probabilities of each choice, (N, K, L).
-        kept: choices that stay open, in any order.
+        free: numbers of the F choices for which no expectation is taken.
 
     Returns:
-        Values of all combinations of the kept choices, (N, L^kept); (N, 1) if none is.
+        Values of all combinations of the free choices, (N, L^F).
     """
     right, levels = 1, probabilities.shape[-1]
     for choice in reversed(range(probabilities.shape[1])):
-        if choice in kept:
+        if choice in free:
             right *= levels
             continue
         table = table.view(len(table), -1, levels, right)

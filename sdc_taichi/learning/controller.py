@@ -1,6 +1,6 @@
-"""A policy as a controller: observes, asks its networks, and decodes their actions.
+"""A policy as a controller: it observes, evaluates its networks, and decodes their actions.
 
-It gives what an environment of its training would decode from the same networks, to the bit.
+Its commands equal those of an environment of its training with the same networks, to the bit.
 """
 
 from __future__ import annotations
@@ -25,21 +25,20 @@ from sdc_taichi.types import F32, I64, Actions
 
 
 class PolicyController:
-    """Controller by a policy; agents that it does not have act as they did in its training.
+    """Controller by a policy; agents without a network act as in its training.
 
     Args:
         policy: the policy.
-        fleet: the data centers it is for.
-        name: what errors call it.
-        others: controller of the agents that the policy does not have; None is that of its
-            training.
+        fleet: the data centers to control.
+        name: name of the controller in messages.
+        others: controller of the agents without a network; None is that of the training.
 
     Attributes:
         policy: the policy.
         commands: fields of ``Actions`` that it gives.
 
     Raises:
-        SdcError: data centers that the policy does not fit, naming the difference.
+        SdcError: the policy does not fit the data centers; the message names the difference.
     """
 
     def __init__(
@@ -50,11 +49,11 @@ class PolicyController:
         self._prepare(fleet)
 
     def __deepcopy__(self, _: Any) -> PolicyController:
-        """A controller of its own, of the same policy, which nothing can change."""
+        """A new controller of the same policy, which is immutable."""
         return PolicyController(self.policy, self._fleet, self._name, self._named_others)
 
     def _prepare(self, fleet: Fleet) -> None:
-        """Make everything that depends on the data centers."""
+        """Build everything that depends on the data centers."""
         interface, others = self.policy.interface, self._named_others
         interface.require_fit(self._name, fleet)
         self._fleet = fleet
@@ -69,20 +68,20 @@ class PolicyController:
         self.commands: tuple[str, ...] = (*decided, *self._by_others)
         self._observer: Observer | ReleasedObserver | None = None
         self._begun = False
-        # Actions of the last decision, which are held until the next.
+        # Actions of the last decision, which are held until the next one.
         self._actions: dict[str, F32 | I64] = {}
 
     def reset(self, seed: int | I64) -> None:
-        """Forget the episode before."""
+        """Begin a new episode."""
         self._others.reset(seed)
         self._begun = False
         self._actions = {}
 
     def act(self, view: View) -> Actions:
-        """Commands of the agents of the policy, and of the others in its training.
+        """Commands of the agents of the policy, and of the other agents as in its training.
 
         Raises:
-            SdcError: data centers that the policy does not fit.
+            SdcError: the policy does not fit the data centers.
         """
         if view.fleet is not self._fleet:
             self._prepare(view.fleet)
@@ -99,7 +98,7 @@ class PolicyController:
         return Actions(**commands)
 
     def _observer_of(self, view: View) -> Observer | ReleasedObserver:
-        """The observer, begun with the episode."""
+        """The observer, reset at the beginning of the episode."""
         if self._observer is None:
             options = self.policy.interface.options()
             self._observer = make_observer(view.fleet, options, new_inputs=True)
@@ -110,21 +109,21 @@ class PolicyController:
 
 
 def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> PolicyController:
-    """The controller that is named ``policy:FOLDER``.
+    """The controller with the name ``policy:FOLDER``.
 
     Args:
-        text: folder of a training run or of a policy.
-        fleet: the data centers it is for.
-        parts: parts of a spec that it is named for.
+        text: folder of a training or of a policy.
+        fleet: the data centers to control.
+        parts: parts of a spec for which the name stands.
 
     Raises:
-        SdcError: no policy there, one that is damaged, or that does not fit the data centers.
+        SdcError: the folder has no policy, or the policy is damaged or does not fit.
     """
     if not text:
         raise ConfigError("controller 'policy': valid is policy:FOLDER, such as policy:runs/happo")
     try:
         policy = Policy.load(Path(text))
-        # Named for some parts, it answers for these alone.
+        # As a part of a spec, the policy gives its own commands alone.
         others = None if set(parts) == set(CONTROLLABLE) else "idle"
         return PolicyController(policy, fleet, f"policy {text}", others)
     except RecursionError:

@@ -22,7 +22,7 @@ from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.types import F32, F64, I64
 
 LEAST_SPREAD = 1e-9
-"""Least spread of the returns of a data center over their size that tells candidates apart."""
+"""Smallest spread of the returns of a data center relative to their size."""
 
 
 @dataclass(slots=True)
@@ -46,17 +46,17 @@ class _Search:
 class CrossEntropySearch:
     """Cross-entropy search; in an update each data center tries a candidate for an episode.
 
-    Data centers differ more than candidates do. So a candidate's figure is not its return, but how
-    far that is above what its data center has had in the updates before, in standard deviations.
+    Data centers differ more than candidates do. A candidate is therefore judged not by its return,
+    but by how far that exceeds the earlier returns of its data center, in standard deviations.
 
     Args:
-        settings: the settings.
+        settings: settings of the algorithm.
         stream: the environments to learn in.
         updates: number of updates of the whole training.
-        seed: seed of all that is drawn.
+        seed: seed of all random numbers.
 
     Raises:
-        ConfigError: more candidates than data centers.
+        ConfigError: there are more candidates than data centers.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class CrossEntropySearch:
         return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the training goes on."""
+        """Complete state, from which the training continues to the same bits."""
         fields = _Search.__dataclass_fields__
         return {
             "done": self._done,
@@ -147,7 +147,7 @@ class CrossEntropySearch:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
         self._done = int(values["done"])
         self._generator.bit_generator.state = values["generator"]
         for name, of in values["learners"].items():
@@ -193,7 +193,7 @@ class CrossEntropySearch:
         return returns
 
     def _select(self, search: _Search, drawn: F64, figures: F64) -> None:
-        """Fit the distributions to the best candidates, and keep them from narrowing too early."""
+        """Fit the distributions to the best candidates, and add noise that keeps them wide."""
         s = self._settings
         best = np.argsort(-figures, kind="stable")[: max(round(s.elite_share * len(figures)), 1)]
         left = max(1.0 - (self._done - 1) / max(self._updates - 1, 1), 0.0)
@@ -215,7 +215,7 @@ def _figures(returns: F64, search: _Search) -> F64:
     """Returns less the usual one of their data center, in its standard deviations, (B,)."""
     departure = returns - search.usual
     spread = np.sqrt(search.spread)
-    # The second update knows no spread of a data center; that of all must do.
+    # In the second update the spread of a data center is unknown; use that of all.
     spread = np.where(spread > 0, spread, np.sqrt(np.mean(departure * departure)))
     least = LEAST_SPREAD * np.maximum(np.abs(search.usual), 1.0)
     return np.asarray(departure / np.maximum(spread, least))

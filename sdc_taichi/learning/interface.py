@@ -1,4 +1,4 @@
-"""Everything of an environment that a policy depends on: what it observes, and what its actions do.
+"""Interface of a policy: the properties of an environment on which its networks depend.
 
 A policy fits an environment, or the data centers of a run, if their interfaces are equal.
 """
@@ -36,7 +36,7 @@ class ObservedFeature(Section):
 
 
 class Interface(Section):
-    """Everything of an environment that a policy depends on."""
+    """Observations and actions of an environment, as far as a policy depends on them."""
 
     agents: tuple[Agent, ...]
     """Agents that act, in the order of their actions."""
@@ -89,7 +89,7 @@ class Interface(Section):
         Args:
             others: further options of the environments, by name.
         """
-        given: dict[str, Any] = {
+        options: dict[str, Any] = {
             "agents": self.agents,
             "actions": self.actions,
             "action_order": self.action_order,
@@ -99,10 +99,13 @@ class Interface(Section):
             "observations": self.observations,
         }
         if self.observations == "default":
-            given["features"] = {a: [f.name for f in own] for a, own in self.features.items()}
-            given["ci_leads_h"] = self.ci_leads_h
-            given["weather_leads_h"] = self.weather_leads_h
-        return make_options(**{k: v for k, v in given.items() if v is not None}, **others)
+            options["features"] = {
+                agent: [feature.name for feature in features]
+                for agent, features in self.features.items()
+            }
+            options["ci_leads_h"] = self.ci_leads_h
+            options["weather_leads_h"] = self.weather_leads_h
+        return make_options(**{k: v for k, v in options.items() if v is not None}, **others)
 
     def difference(self, other: Interface) -> str | None:
         """First difference between this interface and another, as text; None if they are equal."""
@@ -111,31 +114,31 @@ class Interface(Section):
             if mine != theirs:
                 return f"{label}: {_text(mine)} in training, {_text(theirs)} here"
         for agent in self.agents:
-            found = _feature_difference(self.features[agent], other.features[agent])
-            if found is not None:
-                return f"observation of {agent}: {found}"
+            difference = _feature_difference(self.features[agent], other.features[agent])
+            if difference is not None:
+                return f"observation of {agent}: {difference}"
         return None
 
     def require_fit(self, what: str, fleet: Fleet) -> None:
-        """Refuse data centers that a policy with this interface does not fit.
+        """Check that a policy with this interface fits data centers.
 
         Args:
-            what: the policy, for errors.
+            what: name of the policy in messages.
             fleet: the data centers.
 
         Raises:
-            ConfigError: naming what differs.
+            ConfigError: the policy does not fit; the message names the difference.
         """
         step_min = 60 // fleet.steps_per_hour
         if step_min != self.step_min:
-            found: str | None = f"step: {self.step_min} min in training, {step_min} min here"
+            reason: str | None = f"step: {self.step_min} min in training, {step_min} min here"
         else:
             try:
-                found = self.difference(interface_of(fleet, self.options()))
+                reason = self.difference(interface_of(fleet, self.options()))
             except ConfigError as error:
-                found = str(error)
-        if found is not None:
-            raise ConfigError(f"{what}: does not fit these data centers ({found})")
+                reason = str(error)
+        if reason is not None:
+            raise ConfigError(f"{what}: does not fit these data centers ({reason})")
 
 
 _LABELS = {
@@ -163,7 +166,7 @@ def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
         options: options of the environments.
 
     Raises:
-        ConfigError: options that do not fit the data centers, or observations that are no vectors.
+        ConfigError: options do not fit the data centers, or observations contain heat maps.
     """
     if options.heat_map:
         raise ConfigError("heat_map True: policies observe features alone; valid is False")
@@ -223,7 +226,7 @@ def _feature_difference(
 
 
 def _text(value: Any) -> str:
-    """A value of an interface in few words."""
+    """Short text of a value of an interface."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_text(entry)}" for name, entry in value.items())
     if isinstance(value, tuple):

@@ -29,9 +29,11 @@ def generators(seed: int) -> dict[str, torch.Generator]:
 
 
 LEAST_STD = 1e-2
-"""Least standard deviation to divide by: an entry that hardly moves is not blown up."""
+"""Smallest standard deviation to divide by, so that almost constant entries stay small."""
 CLIP = 10.0
-"""Largest normalised value, of either sign."""
+"""Largest absolute normalised value."""
+LAST_GAIN = 0.01
+"""Gain of the last weights of policies and of critics of actions, whose outputs begin near 0."""
 
 
 class RunningMoments:
@@ -83,7 +85,7 @@ class RunningMoments:
         return {"mean": self.mean, "variance": self.variance, "count": self.count}
 
     def load_state_dict(self, values: dict[str, object]) -> None:
-        """Go on from what ``state_dict`` returned."""
+        """Restore the state that ``state_dict`` returned."""
         self.mean, self.variance = _tensor(values["mean"]), _tensor(values["variance"])
         self.count = int(str(values["count"]))
 
@@ -157,7 +159,7 @@ def _linear(width: int, out: int, gain: float, generator: torch.Generator) -> nn
 
 
 def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
-    """Weight, (out, in), and bias, (out,), of each layer, as arrays of their own."""
+    """Copies of the weight, (out, in), and bias, (out,), of each layer."""
     return tuple(
         (layer.weight.detach().float().numpy().copy(), layer.bias.detach().float().numpy().copy())
         for layer in net
@@ -168,14 +170,14 @@ def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
 def policy_network(
     net: nn.Sequential, moments: RunningMoments, spaces: LearnerSpaces, activation: Activation
 ) -> PolicyNetwork:
-    """The network of a policy that a perceptron has come to, with arrays of its own.
+    """The network of a policy with copies of the weights of a perceptron.
 
-    Its actions are the choices of the highest scores, or the outputs cut at -1 and 1.
+    Its actions are the choices with the highest scores, or the outputs cut at -1 and 1.
 
     Args:
         net: the perceptron.
         moments: moments of its observations.
-        spaces: what its learner sees and does.
+        spaces: sizes of the observations and actions of its learner.
         activation: function of all layers but the last.
     """
     return PolicyNetwork(
@@ -197,7 +199,7 @@ class Actor(nn.Module):
     distributions whose standard deviations do not depend on the observation.
 
     Args:
-        spaces: what the learner sees and does.
+        spaces: sizes of the observations and actions of the learner.
         settings: hidden layers and activation.
         generator: source of the weights.
     """
@@ -213,7 +215,7 @@ class Actor(nn.Module):
             settings.hidden,
             outputs,
             activation=settings.activation,
-            last_gain=0.01,
+            last_gain=LAST_GAIN,
             generator=generator,
         )
         if spaces.choices is None:

@@ -1,24 +1,24 @@
-"""HAD3QN and HASAC: one update, of which each algorithm is a case.
+"""HAD3QN and HASAC: one update, of which each algorithm is a special case.
 
-All agents act for some steps, which a replay holds with many before them. Then batches of
+All agents act for some steps, which are added to a replay of earlier steps. Then batches of
 transitions over n decisions are drawn from it. E critics Q_e of the shared state and the actions of
-all learners together fit
+all learners are fitted to
 
     y = r_0 + ... + gamma^(n-1) r_(n-1) + gamma^n V(s_n),
 
-by Adam, where r is the reward of the team and V comes from slow copies of the critics.
-Episodes are cut off, never over, so that V counts at their end too. The algorithms differ in V and
-in how learners follow the critics, one after another in random order:
+by Adam, where r is the reward of the team and V comes from slow copies of the critics. Episodes are
+cut off, never terminated, so V counts at their end too. The algorithms differ in V and in how the
+learners, one after another in random order, learn from the critics:
 
-- ``had3qn`` (Zhong et al. 2024) has one critic, which is dueling (Wang et al. 2016). V is the value
-  of each learner's best choice by its own values (double, van Hasselt et al. 2016), which follow
-  the critic's. Agents act at random with a probability that falls over the training.
+- ``had3qn`` (Zhong et al. 2024) has one dueling critic (Wang et al. 2016). V is the value of the
+  choices that are best by the learners' own values (double, van Hasselt et al. 2016), which are
+  fitted to the critic's. Choices are random with a probability that falls during the training.
 - ``hasac`` (Liu et al. 2024) has two critics, of which the lower value counts. V is soft: the
-  expected value under the policies and their entropies, each weighed by a temperature. Learners
+  expected value under the policies, plus their entropies weighted by temperatures. Learners
   maximise it.
 
-The source of HASAC has a further temperature for the critic; here the critic's V has those of the
-learners, so that critic and learners pursue one sum.
+The source of HASAC has a further temperature for the critic. Here the critic's V has those of the
+learners, so that critic and learners have the same objective.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ class OffPolicy:
 
     Args:
         definition: properties in which the algorithm differs from others.
-        settings: settings.
+        settings: settings of the algorithm.
         stream: the environments to learn in.
         updates: number of updates of the whole training, over which exploration falls.
-        seed: of weights, actions, order of learners and of transitions.
+        seed: seed of weights, actions, order of learners and drawn transitions.
 
     Raises:
-        ConfigError: actions that the algorithm does not take.
+        ConfigError: the algorithm cannot decide such actions.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class OffPolicy:
         return max(s.exploration, 1.0 - (1.0 - s.exploration) * done)
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Act for ``rollout_decisions`` decisions, and learn from what the replay holds.
+        """Act for ``rollout_decisions`` decisions, and learn from the replay.
 
         Args:
             stream: the environments.
@@ -121,14 +121,14 @@ class OffPolicy:
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """The policies as they are, which take the best choice or the mean."""
+        """The current policies, which take the best choice or the mean."""
         columns = dict(self._columns)
         mean, std = self._moments.mean.float().numpy(), self._moments.std.numpy()
-        found = []
+        networks = []
         for name, of in self._spaces.items():
             *inner, (weight, bias) = layers_of(self._actors.nets[name])
             outputs = of.action_width * (of.choices or 1)
-            found.append(
+            networks.append(
                 PolicyNetwork(
                     agents=of.agents,
                     mean=mean[columns[name]].copy(),
@@ -140,10 +140,10 @@ class OffPolicy:
                     choices=of.choices or CHOICES,
                 )
             )
-        return tuple(found)
+        return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the training goes on, the replay included."""
+        """Complete state, including the replay."""
         return {
             "done": self._done,
             "generators": {n: g.get_state() for n, g in self._generators.items()},
@@ -157,16 +157,14 @@ class OffPolicy:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
         self._done = int(values["done"])
         for name, generator in self._generators.items():
             generator.set_state(values["generators"][name])
         with torch.no_grad():
-            for i, (own, slow) in enumerate(
-                zip(self._critic.parameters, self._targets, strict=True)
-            ):
-                own.copy_(values["critic"][str(i)])
-                slow.copy_(values["targets"][str(i)])
+            for i, parameter in enumerate(self._critic.parameters):
+                parameter.copy_(values["critic"][str(i)])
+                self._targets[i].copy_(values["targets"][str(i)])
         self._adam.load_state_dict(values["adam"])
         self._actors.load_state_dict(values["actors"])
         for name, moments in self._all_moments().items():
@@ -193,7 +191,7 @@ class OffPolicy:
     # Acting
 
     def _collect(self, stream: EnvironmentStream, replay: Replay) -> dict[str, float]:
-        """Act with the policies as they are, and return the mean reward of each learner."""
+        """Act with the current policies, and return the mean reward of each learner."""
         rewards = {name: torch.zeros(()) for name in self._spaces}
         seen = []
         with torch.no_grad():
@@ -219,7 +217,7 @@ class OffPolicy:
         return logged if self._soft else logged | {"exploration": self.exploration}
 
     def _measure(self, reward: Tensor) -> None:
-        """Take the reward of a step, (B,), into the moments of rewards and of returns."""
+        """Add the reward of a step, (B,), to the moments of rewards and of returns."""
         self._rewards.add(reward.unsqueeze(-1))
         if not len(self._running_return):
             self._running_return = torch.zeros_like(reward)
@@ -243,7 +241,7 @@ class OffPolicy:
                 optimiser.param_groups[0]["lr"] = rate
 
     def _learn(self, replay: Replay) -> dict[str, Tensor]:
-        """Take a step of the critics, then of each learner, then of the slow critics."""
+        """Update the critics, then each learner, then the slow copies of the critics."""
         s = self._settings
         drawn = replay.sample(s.batch_size, self._generators["batches"])
         before, after = self._situation(drawn.before), self._situation(drawn.after)
@@ -253,15 +251,16 @@ class OffPolicy:
         descend(loss, self._critic.parameters, self._adam, s.gradient_norm)
         logged = self._actors.improve(before, self._generators["order"])
         with torch.no_grad():
-            for slow, own in zip(self._targets, self._critic.parameters, strict=True):
-                slow.lerp_(own, s.target_rate)
+            for slow, parameter in zip(self._targets, self._critic.parameters, strict=True):
+                slow.lerp_(parameter, s.target_rate)
         return {"critic_loss": loss.detach(), **logged}
 
     def _critic_targets(self, drawn: Transitions, after: Situation) -> Tensor:
-        """Values that the critics learn, (N,).
+        """Targets y of the critics, (N,).
 
-        Rewards count from their mean, as none ends an episode, and in standard deviations of the
-        discounted return, so that values are of order one whatever the reward is.
+        The mean reward is subtracted, which changes no policy as episodes never terminate, and the
+        result is divided by the standard deviation of discounted returns, so that values are of
+        order one for any reward.
         """
         discount = self._settings.discount
         later = discount**drawn.steps
@@ -328,26 +327,26 @@ class Transitions(NamedTuple):
 
 
 class Replay:
-    """Latest steps of B environments; their episodes are cut off together.
+    """Latest steps of B environments, whose episodes are cut off together.
 
-    The situation that an episode was cut off in has a row of its own, without actions. So the row
-    after a step always holds what followed it, and each situation is held once.
+    A row is the situation of all environments at one time: shared state and observations. The
+    situation at the end of an episode has a row without actions, so that the row after a step is
+    always the situation that followed it.
 
     Args:
         size: largest number of situations of all environments together.
         num_envs: number of environments, B.
-        width: entries of a situation, which is what all learners and the critic see.
-        actions: numbers that are decided in each step.
+        width: number of entries of a situation.
+        actions: number of actions in each step.
         steps: largest number of steps of a transition, n.
         discount: weight of a reward one step later.
 
     Attributes:
-        rows: situations in time, at most.
-        filled: situations in time, so far.
+        rows: largest number of rows.
         num_envs: number of environments, B.
 
     Raises:
-        ConfigError: a size that holds no transition of n steps.
+        ConfigError: the replay is too small for a transition of n steps.
     """
 
     def __init__(
@@ -361,7 +360,7 @@ class Replay:
                 f"valid is at least {least * num_envs}"
             )
         self._width, self._steps, self._discount = width, steps, discount
-        # Situation, actions and reward side by side, so that a draw reads memory in one place.
+        # Situation, actions and reward are adjacent, so that a draw reads memory in one place.
         self._data = torch.empty(self.rows, num_envs, width + actions + 1)
         self._is_end = torch.zeros(self.rows, dtype=torch.bool)
         self._count = 0
@@ -370,13 +369,8 @@ class Replay:
 
     @property
     def filled(self) -> int:
-        """Number of steps and ends of episodes that are held."""
+        """Number of rows in use."""
         return min(self._count, self.rows)
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the replay, in bytes."""
-        return int(self._data.element_size() * self._data.numel())
 
     def add(self, situations: Tensor, actions: Tensor, rewards: Tensor) -> None:
         """Append a step of all environments.
@@ -398,16 +392,16 @@ class Replay:
         row[:, self._width :] = 0.0
 
     def sample(self, number: int, generator: torch.Generator) -> Transitions:
-        """Draw transitions, all equally likely.
+        """Draw transitions with equal probability.
 
-        One that meets the end of its episode, or the latest step, is as long as it can be.
+        A transition is shorter than n steps if its episode or the replay ends before.
 
         Args:
-            number: how many, N.
+            number: number of transitions, N.
             generator: source of the draws.
 
         Raises:
-            SdcError: fewer than two situations in time.
+            SdcError: the replay has fewer than two rows.
         """
         if self._starts is None:
             self._starts = self._find_starts()
@@ -439,10 +433,10 @@ class Replay:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` of a replay made alike returned.
+        """Restore what ``state_dict`` of a replay with equal arguments returned.
 
         Raises:
-            SdcError: made by another replay.
+            SdcError: the state is of a replay of another shape.
         """
         data = torch.as_tensor(values["data"])
         filled = min(int(values["count"]), self.rows)
@@ -463,7 +457,7 @@ class Replay:
         return self._data[at]
 
     def _find_starts(self) -> Tensor:
-        """Rows that a transition can start from; sets how many steps it has from each row."""
+        """Rows from which a transition can start; sets the number of its steps for each row."""
         in_time = torch.arange(self._count - self.filled, self._count)
         stops = self._is_end[in_time % self.rows].clone()
         stops[-1] = True

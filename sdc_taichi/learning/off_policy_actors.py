@@ -1,7 +1,8 @@
-"""Policies that learn from a critic of joint actions: those of HAD3QN and of HASAC.
+"""Policies of HAD3QN and HASAC, which learn from a critic of joint actions.
 
-Learners improve one after another in random order, each against what those before it have become
-and what those after it still are (Zhong et al. 2024): no two of them move for the same gain.
+Learners are updated one after another in random order (Zhong et al. 2024). Each is updated for the
+new policies of the learners before it and the old policies of those after it, so that no two of
+them react to the same gain.
 """
 
 from __future__ import annotations
@@ -15,20 +16,18 @@ from torch import Tensor, nn
 
 from sdc_taichi.learning.action_values import ContinuousValues, JointValues, expected
 from sdc_taichi.learning.algorithms import OffPolicySettings
-from sdc_taichi.learning.networks import perceptron
+from sdc_taichi.learning.networks import LAST_GAIN, perceptron
 from sdc_taichi.learning.stream import LearnerSpaces
 
 LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
-"""Limits of the logarithm of standard deviations of continuous actions before they are squashed."""
-LAST_GAIN = 0.01
-"""Gain of the last weights of a policy, which begins with almost equal choices."""
+"""Bounds of the logarithm of the standard deviation of actions before the hyperbolic tangent."""
 
 Values = TypeVar("Values", bound=JointValues | ContinuousValues)
-"""Critics that policies may follow: of choices, or of continuous numbers."""
+"""Type of the critic: of choices, or of continuous numbers."""
 
 
 class Situation(NamedTuple):
-    """Normalised observations of N environments, from which critics value and learners act."""
+    """Normalised shared state and observations of N environments."""
 
     state: Tensor
     """Shared state, (N, m)."""
@@ -37,22 +36,22 @@ class Situation(NamedTuple):
 
 
 class Actors(Generic[Values]):
-    """Networks of all learners, whose K numbers stand side by side.
+    """Networks of all learners, which decide K numbers side by side.
 
-    A network has an output for each choice of a number, or, where a number is continuous, one for
-    its mean and one for the logarithm of its standard deviation.
+    A network has an output for each choice of a number. For a continuous number it has one output
+    for the mean and one for the logarithm of the standard deviation.
 
     Args:
-        critic: values that the policies follow.
-        spaces: what each learner sees and does.
-        settings: settings.
+        critic: critic that the policies learn from.
+        spaces: sizes of the observations and actions of each learner.
+        settings: settings of the algorithm.
         generator: source of the weights.
 
     Attributes:
         nets: network of each learner.
         adams: optimiser of each learner's network.
-        numbers: columns of each learner's numbers among all.
-        head: what makes actions of the first outputs, as ``PolicyNetwork`` names it.
+        numbers: columns of each learner's numbers.
+        head: head of the policies' networks, as in ``PolicyNetwork``.
     """
 
     head: Literal["argmax", "tanh"] = "argmax"
@@ -91,7 +90,7 @@ class Actors(Generic[Values]):
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned."""
+        """Restore the state that ``state_dict`` returned."""
         for name, net in self.nets.items():
             net.load_state_dict(values[name]["net"])
             self.adams[name].load_state_dict(values[name]["adam"])
@@ -107,7 +106,7 @@ class Actors(Generic[Values]):
         )
 
     def _descend(self, loss: Tensor, name: str) -> None:
-        """Take a step of a learner's network down a loss."""
+        """Take a gradient step of a learner's network."""
         descend(
             loss, list(self.nets[name].parameters()), self.adams[name], self._settings.gradient_norm
         )
@@ -119,19 +118,19 @@ class Actors(Generic[Values]):
 
 
 class GreedyActors(Actors[JointValues]):
-    """Individual values of each choice, of which the best is taken: HAD3QN (Zhong et al. 2024).
+    """Values of each learner's choices, of which it takes the best: HAD3QN (Zhong et al. 2024).
 
-    Each learner's values follow the row of the critic's table in which the others do what they do,
-    those before it in a random order already their best choice in the table. The source fits the
-    value of the best choice alone; the row has those of all other choices too.
+    A learner's values are fitted to the row of the critic's table for the choices of the others:
+    the updated choices of the learners before it in a random order, the current ones of those
+    after it. The source fits the value of the best choice alone; the row has those of all choices.
     """
 
     def act(self, situation: Situation, exploration: float, generator: torch.Generator) -> Tensor:
-        """Best choices, (N, K), each replaced by a random one with a probability.
+        """Best choices, (N, K), some of them replaced by random ones.
 
         Args:
-            situation: what is seen.
-            exploration: the probability, epsilon.
+            situation: what the learners observe.
+            exploration: probability of a random choice, epsilon.
             generator: source of the draws.
         """
         best = self._choice_outputs(situation).argmax(-1)
@@ -168,15 +167,15 @@ class GreedyActors(Actors[JointValues]):
 
 
 class EntropicActors(Actors[Values]):
-    """Policies drawn from, with a reward for their entropy.
+    """Stochastic policies with a reward for their entropy.
 
-    Each learner has a temperature of its own, tuned so that its entropy meets a target (Haarnoja et
+    Each learner has a temperature, which is adjusted until its entropy equals a target (Haarnoja et
     al. 2018).
 
     Args:
-        critic: values that the policies follow.
-        spaces: what each learner sees and does.
-        settings: settings.
+        critic: critic that the policies learn from.
+        spaces: sizes of the observations and actions of each learner.
+        settings: settings of the algorithm.
         generator: source of the weights.
     """
 
@@ -188,10 +187,12 @@ class EntropicActors(Actors[Values]):
         generator: torch.Generator,
     ) -> None:
         super().__init__(critic, spaces, settings, generator)
-        targets = {
-            name: wanted_entropy(of.choices, settings) * of.action_width
-            for name, of in spaces.items()
-        }
+        targets = {}
+        for name, of in spaces.items():
+            of_number = settings.continuous_entropy
+            if of.choices is not None:
+                of_number = settings.entropy_share * math.log(of.choices)
+            targets[name] = of_number * of.action_width
         self._temperatures = Temperatures(targets, settings)
 
     def state_dict(self) -> dict[str, Any]:
@@ -199,12 +200,12 @@ class EntropicActors(Actors[Values]):
         return super().state_dict() | {"temperatures": self._temperatures.state_dict()}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned."""
+        """Restore the state that ``state_dict`` returned."""
         super().load_state_dict(values)
         self._temperatures.load_state_dict(values["temperatures"])
 
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
-        """Move a learner down its loss and its temperature by its entropy; numbers to log."""
+        """Update the network and the temperature of a learner, and return numbers to log."""
         self._descend(loss, name)
         self._temperatures.follow(name, entropy)
         return {
@@ -215,10 +216,10 @@ class EntropicActors(Actors[Values]):
 
 
 class SoftActors(EntropicActors[JointValues]):
-    """Independent choices of each learner, paid for their entropy: HASAC (Liu et al. 2024).
+    """Random choices of each learner, with a reward for entropy: HASAC (Liu et al. 2024).
 
-    The critic has an output for each joint action, so that all expected values are exact (as
-    Christodoulou 2019 for one agent).
+    The critic has an output for each joint action, so that all expected values are exact, as in
+    Christodoulou (2019) for one agent.
     """
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
@@ -230,7 +231,7 @@ class SoftActors(EntropicActors[JointValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
     ) -> Tensor:
-        """Soft values of the target critic, (N,): expected value and entropies by temperature."""
+        """Soft values of the target critic, (N,): expected value plus temperature x entropy."""
         log_p = self._choice_outputs(after).log_softmax(-1)
         value = expected(self._critic(after.state, targets).amin(0), log_p.exp()).squeeze(-1)
         return value + sum(
@@ -247,8 +248,8 @@ class SoftActors(EntropicActors[JointValues]):
         logged: dict[str, Tensor] = {}
         for name in self._order(generator):
             numbers = self.numbers[name]
-            own = range(*numbers.indices(probabilities.shape[1]))
-            values = expected(table, probabilities, own)
+            free = range(*numbers.indices(probabilities.shape[1]))
+            values = expected(table, probabilities, free)
             loss = soft_policy_loss(log_p[name], values, self._temperatures.of(name))
             logged |= self._step(name, loss, entropies(log_p[name].detach()).mean())
             with torch.no_grad():
@@ -262,10 +263,10 @@ class SoftActors(EntropicActors[JointValues]):
 
 
 class GaussianActors(EntropicActors[ContinuousValues]):
-    """Continuous actions of each learner, paid for their entropy: HASAC (Liu et al. 2024).
+    """Continuous actions of each learner, with a reward for entropy: HASAC (Liu et al. 2024).
 
-    An action is the hyperbolic tangent of a normal number (Haarnoja et al. 2018), through which
-    gradients of the critic reach the policy.
+    An action is the hyperbolic tangent of a normal number (Haarnoja et al. 2018), and gradients of
+    the critic reach the policy through the action.
     """
 
     head = "tanh"
@@ -285,12 +286,12 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Raise the soft value by one learner after another, and return losses and entropies."""
         drawn = {name: self._draw(name, situation, generator) for name in self.nets}
-        actions = torch.cat([own.detach() for own, _ in drawn.values()], dim=1)
+        actions = torch.cat([part.detach() for part, _ in drawn.values()], dim=1)
         logged: dict[str, Tensor] = {}
         for name in self._order(generator):
             numbers = self.numbers[name]
-            own, log_p = drawn[name]
-            joint = torch.cat([actions[:, : numbers.start], own, actions[:, numbers.stop :]], 1)
+            part, log_p = drawn[name]
+            joint = torch.cat([actions[:, : numbers.start], part, actions[:, numbers.stop :]], 1)
             value = self._critic.of_actions(situation.state, joint).amin(0)
             loss = (self._temperatures.of(name) * log_p - value).mean()
             logged |= self._step(name, loss, -log_p.detach().mean())
@@ -317,11 +318,11 @@ class GaussianActors(EntropicActors[ContinuousValues]):
 
 
 class Temperatures:
-    """Weights of the entropy of each learner, tuned so that it meets a target.
+    """Weight of the entropy of each learner, adjusted until the entropy equals a target.
 
     Args:
-        targets: wanted entropy of each learner, nats.
-        settings: settings.
+        targets: target entropy of each learner, nats.
+        settings: settings of the algorithm.
     """
 
     def __init__(self, targets: Mapping[str, float], settings: OffPolicySettings) -> None:
@@ -349,7 +350,7 @@ class Temperatures:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned."""
+        """Restore the state that ``state_dict`` returned."""
         for name, log in self._logs.items():
             with torch.no_grad():
                 log.copy_(torch.as_tensor(values[name]["log"]))
@@ -357,19 +358,19 @@ class Temperatures:
 
 
 def adam(parameters: Any, rate: float) -> torch.optim.Adam:
-    """Adam (Kingma, Ba 2015) with one pass over all parameters."""
+    """Adam (Kingma, Ba 2015), fused: one pass over all parameters."""
     return torch.optim.Adam(parameters, rate, fused=True)
 
 
 def descend(
     loss: Tensor, parameters: Sequence[Tensor], optimiser: torch.optim.Adam, norm: float
 ) -> None:
-    """Take a step down a loss, along which nothing but the parameters changes.
+    """Take a gradient step of some parameters, without gradients of others.
 
     Args:
         loss: the loss, ().
-        parameters: what the optimiser moves.
-        optimiser: moves them.
+        parameters: parameters of the optimiser.
+        optimiser: the optimiser.
         norm: largest norm of the gradient.
     """
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
@@ -380,13 +381,13 @@ def descend(
 
 
 def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: int) -> Tensor:
-    """Values of each number's choices while the others stay, one number after another.
+    """Values of each number's choices for fixed choices of the others, one number after another.
 
     Args:
         table: values of all joint actions, (N, L^K).
-        choices: choices before any has moved, (N, K).
-        order: numbers in the order in which they move to their best choice.
-        levels: how many possibilities each choice has, L.
+        choices: choices at the beginning, (N, K).
+        order: numbers in the order in which each changes to its best choice.
+        levels: number of possibilities of each choice, L.
 
     Returns:
         Values, (N, K, L).
@@ -410,18 +411,6 @@ def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tens
     """
     value = expected(values, log_p.exp()).squeeze(-1)
     return -(value + temperature * entropies(log_p)).mean()
-
-
-def wanted_entropy(choices: int | None, settings: OffPolicySettings) -> float:
-    """Entropy that a policy is to keep in each number, nats.
-
-    Args:
-        choices: number of choices that there are; None where the number is continuous.
-        settings: settings.
-    """
-    if choices is None:
-        return settings.continuous_entropy
-    return settings.entropy_share * math.log(choices)
 
 
 def entropies(log_p: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""PPO, IPPO, MAPPO, HAPPO and HAA2C: one update, of which each algorithm is a case.
+"""PPO, IPPO, MAPPO, HAPPO and HAA2C: one update, of which each algorithm is a special case.
 
 All agents act for some steps with fixed policies. Then each learner i maximises, by Adam,
 
@@ -18,7 +18,7 @@ input, in whose reward it learns, in M_i, and in clipping:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -41,7 +41,7 @@ ADAM_EPSILON = 1e-5
 
 
 class _Critic(NamedTuple):
-    """A critic, with the moments of what it sees and of the returns that it learns."""
+    """A critic, with the moments of its inputs and of the returns that it learns."""
 
     net: nn.Sequential
     adam: torch.optim.Adam
@@ -68,10 +68,10 @@ class OnPolicy:
 
     Args:
         definition: properties in which the algorithm differs from others.
-        settings: settings.
+        settings: settings of the algorithm.
         stream: the environments to learn in.
         updates: number of updates of the whole training, over which the learning rate falls.
-        seed: of weights, actions, order of learners and of mini-batches.
+        seed: seed of weights, actions, order of learners and mini-batches.
     """
 
     def __init__(
@@ -110,8 +110,8 @@ class OnPolicy:
             Numbers to log: ``reward/NAME``, the mean over steps; losses; entropies.
         """
         rollout = self._collect(stream)
-        held = self._settings.decision_steps
-        logged = {f"reward/{n}": float(r.mean()) / held for n, r in rollout.rewards.items()}
+        steps = self._settings.decision_steps
+        logged = {f"reward/{n}": float(r.mean()) / steps for n, r in rollout.rewards.items()}
         self._done += 1
         if self._done > 1:
             self._anneal()
@@ -123,7 +123,7 @@ class OnPolicy:
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """The policies as they are."""
+        """The current policies."""
         activation = self._settings.activation
         return tuple(
             policy_network(self._actors[name].net, self._moments[name], of, activation)
@@ -131,7 +131,7 @@ class OnPolicy:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the training goes on."""
+        """Complete state, from which the training continues to the same bits."""
         return {
             "done": self._done,
             "generators": {n: g.get_state() for n, g in self._generators.items()},
@@ -150,7 +150,7 @@ class OnPolicy:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
         self._done = int(values["done"])
         for name, generator in self._generators.items():
             generator.set_state(values["generators"][name])
@@ -165,42 +165,34 @@ class OnPolicy:
     # Acting
 
     def _collect(self, stream: EnvironmentStream) -> _Rollout:
-        """Act with the policies as they are."""
-        steps, size = self._settings.rollout_decisions, stream.size
-
-        def room(width: int | None, kind: torch.dtype = torch.float32) -> Tensor:
-            return torch.empty((steps, size) if width is None else (steps, size, width), dtype=kind)
-
-        of_each = self._spaces.items()
-        kinds = {n: torch.float32 if of.choices is None else torch.int64 for n, of in of_each}
-        out = _Rollout(
-            {n: room(of.observation_width) for n, of in of_each},
-            {n: room(of.observation_width) for n, of in of_each},
-            room(stream.state_width),
-            room(stream.state_width),
-            {n: room(of.action_width, kinds[n]) for n, of in of_each},
-            {n: room(None) for n in self._spaces},
-            {n: room(None) for n in self._spaces},
-            room(None),
-            torch.zeros(steps),
-        )
+        """Act with the current policies."""
+        decisions = []
         with torch.no_grad():
-            for t in range(steps):
-                out.state[t] = stream.state
-                for name in self._spaces:
-                    seen = stream.observations[name]
-                    actions, log_p = self._actors[name].sample(
-                        self._moments[name].normalise(seen), self._generators["actions"]
+            for _ in range(self._settings.rollout_decisions):
+                state, observations = stream.state, stream.observations
+                drawn = {
+                    name: actor.sample(
+                        self._moments[name].normalise(observations[name]),
+                        self._generators["actions"],
                     )
-                    out.observations[name][t] = seen
-                    out.actions[name][t], out.log_p[name][t] = actions, log_p
-                after = stream.step({n: _within_space(out.actions[n][t]) for n in self._spaces})
-                for name in self._spaces:
-                    out.rewards[name][t] = after.rewards[name]
-                    out.next_observations[name][t] = after.next_observations[name]
-                out.team[t] = after.team
-                out.next_state[t], out.ended[t] = after.next_state, float(after.ended)
-        return out
+                    for name, actor in self._actors.items()
+                }
+                actions = {name: actions for name, (actions, _) in drawn.items()}
+                after = stream.step({n: _within_space(values) for n, values in actions.items()})
+                decisions.append(
+                    _Rollout(
+                        observations=observations,
+                        next_observations=after.next_observations,
+                        state=state,
+                        next_state=after.next_state,
+                        actions=actions,
+                        log_p={name: log_p for name, (_, log_p) in drawn.items()},
+                        rewards=after.rewards,
+                        team=after.team,
+                        ended=torch.tensor(float(after.ended)),
+                    )
+                )
+        return _Rollout(*(_stacked(values) for values in zip(*decisions, strict=True)))
 
     # Learning
 
@@ -257,7 +249,7 @@ class OnPolicy:
         return normal, (targets - of.returns.mean.float()) / of.returns.std
 
     def _rescale(self, critic: _Critic, targets: Tensor) -> None:
-        """Take returns into account, and keep what the critic says (van Hasselt et al. 2016)."""
+        """Add returns to the moments without changing values (Pop-Art, van Hasselt et al. 2016)."""
         mean, std = critic.returns.mean.float(), critic.returns.std
         critic.returns.add(targets.unsqueeze(-1))
         last = critic.net[-1]
@@ -288,7 +280,7 @@ class OnPolicy:
         seen = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
         actions = rollout.actions[name].flatten(0, 1)
         old_log_p = rollout.log_p[name].flatten()
-        weighed = advantages if weight is None else advantages * weight
+        weighted = advantages if weight is None else advantages * weight
         clip = self._settings.clip if self._definition.clips else None
         totals = torch.zeros(2)
         batches = self._batches(len(actions))
@@ -296,14 +288,14 @@ class OnPolicy:
             rows = seen.index_select(0, batch), actions.index_select(0, batch)
             log_p, entropy = actor.evaluate(*rows)
             ratio = (log_p - old_log_p[batch]).exp()
-            loss = policy_loss(ratio, weighed[batch], clip)
+            loss = policy_loss(ratio, weighted[batch], clip)
             self._descend(loss - self._settings.entropy * entropy, actor, adam)
             totals += torch.stack([loss.detach(), entropy.detach()])
         loss_mean, entropy_mean = (totals / len(batches)).tolist()
         return {f"policy_loss/{name}": loss_mean, f"entropy/{name}": entropy_mean}
 
     def _ratio(self, name: str, rollout: _Rollout) -> Tensor:
-        """New probability of the actions that were made over the old one, (T * B,)."""
+        """Ratio of the new to the old probability of the actions, (T * B,)."""
         seen = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
         with torch.no_grad():
             log_p, _ = self._actors[name].evaluate(seen, rollout.actions[name].flatten(0, 1))
@@ -325,7 +317,7 @@ class OnPolicy:
         """Rows of each mini-batch of all passes."""
         s = self._settings
         if not self._definition.clips:
-            # Without clipping, ratios are right in the first step alone.
+            # Without clipping, the ratios are valid for one gradient step alone.
             return [torch.arange(rows)]
         generator = self._generators["batches"]
         orders = [torch.randperm(rows, generator=generator) for _ in range(s.epochs)]
@@ -338,7 +330,7 @@ class OnPolicy:
         adam.step()
 
     def _anneal(self) -> None:
-        """Set the learning rate of the update."""
+        """Lower the learning rate, in even steps to 0 over the training."""
         if not self._settings.anneal:
             return
         left = max(1.0 - (self._done - 1) / max(self._updates, 1), 0.0)
@@ -414,6 +406,13 @@ def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor
 def value_loss(values: Tensor, targets: Tensor) -> Tensor:
     """Half the mean squared error of values, (n,)."""
     return 0.5 * (values - targets).square().mean()
+
+
+def _stacked(values: Sequence[Any]) -> Any:
+    """Tensors of several decisions as one, (T, ...); in dicts, one for each name."""
+    if isinstance(values[0], dict):
+        return {name: torch.stack([value[name] for value in values]) for name in values[0]}
+    return torch.stack(list(values))
 
 
 def _within_space(actions: Tensor) -> Tensor:

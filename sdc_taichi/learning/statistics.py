@@ -55,10 +55,10 @@ def bootstrap_interval(
         generator: draws.
         draws: number of draws.
         level: share of the draws inside the interval.
-        paired: whether samples are paired by their trainings too, as where seeds decide inputs.
+        paired: whether samples are also paired by their trainings, as when seeds decide inputs.
 
     Raises:
-        ConfigError: samples of other weeks than the strata.
+        ConfigError: a sample and the strata have different numbers of weeks.
     """
     weeks = drawn_weeks(strata, generator, draws)
     values = bootstrap_values(statistic, samples, weeks, generator, paired=paired)
@@ -73,20 +73,20 @@ def bootstrap_values(
     *,
     paired: bool = False,
 ) -> F64:
-    """A statistic of samples in each draw of weeks, and of trainings drawn for each sample.
+    """Values of a statistic over bootstrap draws of weeks and of trainings.
 
     Args:
         statistic: function of the samples.
         samples: samples that are paired by their weeks, (S, W) each, of any S.
         weeks: numbers of the weeks of each draw, of ``drawn_weeks``, (draws, W).
-        generator: draws trainings.
-        paired: whether the same trainings are drawn of all samples that have as many.
+        generator: source of the draws of trainings.
+        paired: whether the same trainings are drawn from all samples of equal size.
 
     Returns:
         The values, (draws,).
 
     Raises:
-        ConfigError: samples of another number of weeks.
+        ConfigError: a sample has another number of weeks.
     """
     draws, width = weeks.shape
     drawn = []
@@ -133,9 +133,9 @@ def share_pct(figures: F64, idle: F64, achieved: F64) -> F64:
         idle: of idle commands, (..., 1, W).
         achieved: of the optimum's achieved path, (..., 1, W).
     """
-    own, base, best = (x.mean(axis=-2).sum(axis=-1) for x in (figures, idle, achieved))
+    total, base, best = (x.mean(axis=-2).sum(axis=-1) for x in (figures, idle, achieved))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(base > best, 100.0 * (base - own) / (base - best), np.nan))
+        return np.asarray(np.where(base > best, 100.0 * (base - total) / (base - best), np.nan))
 
 
 def sample_mean(values: F64) -> F64:
@@ -202,6 +202,6 @@ def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int = DRAWS)
     """
     weeks = np.empty((draws, len(strata)), dtype=np.int64)
     for stratum in np.unique(strata):
-        own = np.flatnonzero(strata == stratum)
-        weeks[:, own] = generator.choice(own, size=(draws, len(own)))
+        numbers = np.flatnonzero(strata == stratum)
+        weeks[:, numbers] = generator.choice(numbers, size=(draws, len(numbers)))
     return weeks

@@ -1,7 +1,7 @@
-"""A stream of transitions from a batch of environments, as tensors, one learner at a time.
+"""Transitions from a batch of environments as tensors, for each learner.
 
-A learner is whatever has one policy: one agent, or all learning agents together. Episodes follow
-each other without a gap; where they are cut off, a step also holds what they ended with.
+A learner has one policy; it acts for one agent, or for all learning agents together. A new episode
+begins as soon as one is cut off, and the step that cuts it off also holds its last observations.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sdc_taichi.learning.policy import CHOICES, action_levels
 from sdc_taichi.types import F64
 
 JOINT = "joint"
-"""Name of the learner that stands for all learning agents."""
+"""Name of the learner that acts for all learning agents."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,8 @@ class LearnerSpaces:
     action_width: int
     """Number of numbers that it decides, k."""
     choices: int | None
-    """Number of choices for each number: 3 with discrete actions, or the levels of continuous ones;
-    None where each is any number within -1..1."""
+    """Number of choices for each number: 3 for discrete actions, the number of levels for
+    continuous actions with levels; None for any number within -1..1."""
 
 
 class StreamStep(NamedTuple):
@@ -52,10 +52,10 @@ class StreamStep(NamedTuple):
     ended: bool
     """Whether the episodes were cut off after the step; those of a batch end together."""
     next_observations: dict[str, Tensor]
-    """Observations after the step by learner, (B, n) each; of the same episode even where it was
-    cut off."""
+    """Observations after the step by learner, (B, n) each; those of the old episode if the step
+    cut it off."""
     next_state: Tensor
-    """Shared state after the step, (B, m); of the same episode even where it was cut off."""
+    """Shared state after the step, (B, m); that of the old episode if the step cut it off."""
 
 
 class _Rewards(NamedTuple):
@@ -66,32 +66,32 @@ class _Rewards(NamedTuple):
 
 
 class EnvironmentStream:
-    """Environments without end, whose episodes begin anew by themselves.
+    """Environments that begin a new episode as soon as the last one is cut off.
 
     Args:
-        env: a batch, as ``sdc_taichi.vector_env`` makes it.
-        joint: whether all learning agents are one learner.
-        decision_steps: steps between two decisions, in which an action is held.
-        levels: number of levels, evenly from -1 to 1, that learners choose continuous actions from;
-            None is any number.
-        shares_state: whether the shared state is wanted, which takes time.
-        against_idle: whether rewards of idle commands in the same step are subtracted, where
-            all episodes of a data center have the same inputs.
-        seed: seed of the first reset; environment i takes ``seed + i``.
+        env: batch of environments made by ``sdc_taichi.vector_env``.
+        joint: whether one learner acts for all learning agents.
+        decision_steps: steps between two decisions; actions are held in between.
+        levels: number of levels, evenly from -1 to 1, from which learners choose continuous
+            actions; None is any number.
+        shares_state: whether to compute the shared state, which takes time.
+        against_idle: whether to subtract the rewards of idle commands in the same step, if all
+            episodes of a data center have the same inputs.
+        seed: seed of the first reset; environment i has ``seed + i``.
 
     Attributes:
         learners: names of the learners.
-        spaces: what each learner sees and does.
-        state_width: number of entries of the shared state, m; 0 if it is not wanted.
+        spaces: sizes of the observations and actions of each learner.
+        state_width: number of entries of the shared state, m; 0 without it.
         size: number of environments, B.
         decision_steps: steps between two decisions.
         observations: observations before the next step by learner, (B, n) each.
         state: shared state before the next step, (B, m).
-        returns: sum of the rewards of the last whole episodes by learner, the mean over all
-            environments; empty before an episode has ended.
+        returns: mean over all environments of the sum of rewards in the last complete episode, by
+            learner; empty before an episode has ended.
 
     Raises:
-        ConfigError: observations with heat maps, which these networks do not take.
+        ConfigError: observations contain heat maps, which perceptrons cannot read.
     """
 
     def __init__(
@@ -113,7 +113,21 @@ class EnvironmentStream:
         if core.options.actions == "continuous" and levels is not None:
             self._levels = torch.from_numpy(action_levels(levels))
         self.size, self.decision_steps = core.num_envs, decision_steps
-        self.spaces = _spaces(core.agents, env, self._joint, levels)
+        if self._joint is not None:
+            parts = {JOINT: (core.agents, self._joint.observation_space, self._joint.action_space)}
+        else:
+            parts = {
+                a: ((a,), env.observation_spaces[a], env.action_spaces[a]) for a in core.agents
+            }
+        self.spaces = {
+            name: LearnerSpaces(
+                agents,
+                int(np.prod(observation.shape or (1,))),
+                int(np.prod(action.shape or (1,))),
+                levels if isinstance(action, spaces.Box) else CHOICES,
+            )
+            for name, (agents, observation, action) in parts.items()
+        }
         self.learners = tuple(self.spaces)
         self._shares_state = shares_state
         self.state_width = int(np.prod(core.state_space.shape or ())) if shares_state else 0
@@ -128,10 +142,10 @@ class EnvironmentStream:
         """Advance all environments to the next decision, or to the end of their episodes.
 
         Args:
-            actions: of each learner, (B, k): numbers of choices, or numbers within -1..1.
+            actions: actions of each learner, (B, k): numbers of choices, or numbers within -1..1.
 
         Returns:
-            The situation after the last step, and rewards summed over the steps.
+            Observations after the last step, and the sums of the rewards of the steps.
         """
         core, by_agent = self._core, self._by_agent(actions)
         transition = core.step(by_agent)
@@ -159,45 +173,45 @@ class EnvironmentStream:
         return self._core.steps
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the environments, for ``load_state_dict`` of a stream made alike."""
+        """State of the environments, for ``load_state_dict`` of a stream with equal arguments."""
         sums = {"returns": dict(self.returns), "sums": dict(self._sums)}
         return {"environments": self._core.state_dict(), **sums}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned.
+        """Restore the state that ``state_dict`` returned.
 
         Raises:
-            SdcError: a state of other environments.
+            SdcError: the state is of other environments.
         """
         self._take(self._core.load_state_dict(values["environments"]))
         self.returns, self._sums = dict(values["returns"]), dict(values["sums"])
 
     def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Actions by agent as arrays, (B,) where an agent decides one choice, else (B, k)."""
+        """Actions by agent as arrays, (B,) if an agent makes one choice, else (B, k)."""
         levels = self._levels
         arrays = {
-            name: (given if levels is None else levels[given]).numpy()
-            for name, given in actions.items()
+            name: (values if levels is None else levels[values]).numpy()
+            for name, values in actions.items()
         }
         if self._joint is not None:
             return self._joint.actions(arrays[JOINT])
         return {
-            agent: given[:, 0] if given.dtype == np.int64 and given.shape[1] == 1 else given
-            for agent, given in arrays.items()
+            agent: values[:, 0] if values.dtype == np.int64 and values.shape[1] == 1 else values
+            for agent, values in arrays.items()
         }
 
     def _rewards(self, transition: Transition) -> _Rewards:
-        """Rewards of a step, less those of idle commands in it if they are known."""
-        found = self._rewards_as_they_are(transition)
+        """Rewards of a step, less those of idle commands in the same step if they are recorded."""
+        rewards = self._full_rewards(transition)
         if not self._idle:
-            return found
+            return rewards
         idle = self._idle[transition.result.step]
         by_learner = {
-            name: found.by_learner[name] - idle.by_learner[name] for name in self.learners
+            name: rewards.by_learner[name] - idle.by_learner[name] for name in self.learners
         }
-        return _Rewards(by_learner, found.team - idle.team)
+        return _Rewards(by_learner, rewards.team - idle.team)
 
-    def _rewards_as_they_are(self, transition: Transition) -> _Rewards:
+    def _full_rewards(self, transition: Transition) -> _Rewards:
         joint = transition.joint_reward
         by_learner = transition.rewards if self._joint is None else {JOINT: joint}
         return _Rewards(by_learner, joint / len(self._core.agents))
@@ -205,54 +219,24 @@ class EnvironmentStream:
     def _rewards_of_idle(self, seed: int) -> list[_Rewards]:
         """Rewards of each step of an episode of idle commands.
 
-        They do not depend on what a learner does, so the policy that is best with rewards less
-        these is the one that is best without (Weaver and Tao 2001), and demand, weather and grid,
-        which move rewards more than any action, are out of the way.
+        They do not depend on the actions of learners, so subtracting them changes no optimal policy
+        (Weaver and Tao 2001). It removes the effects of demand, weather and grid, which exceed
+        those of any action.
         """
         core = self._core
         core.reset(seed)
-        found = []
-        for _ in range(core.steps):
-            found.append(self._rewards_as_they_are(core.step(core.idle_actions())))
-        return found
+        return [self._full_rewards(core.step(core.idle_actions())) for _ in range(core.steps)]
 
     def _take(self, by_agent: Mapping[str, Observation]) -> None:
-        """Keep observations and shared state before the next step."""
-        found = by_agent if self._joint is None else {JOINT: self._joint.observation(by_agent)}
-        self.observations = {name: _tensor(found[name]) for name in self.learners}
+        """Set observations and shared state before the next step."""
+        seen = by_agent if self._joint is None else {JOINT: self._joint.observation(by_agent)}
+        self.observations = {name: _tensor(seen[name]) for name in self.learners}
         if self._shares_state:
             self.state = _tensor(self._core.state())
         else:
             self.state = torch.empty(self.size, 0)
 
 
-def _spaces(
-    agents: tuple[str, ...],
-    env: MultiAgentVectorEnv,
-    joint: JointLearner | None,
-    levels: int | None,
-) -> dict[str, LearnerSpaces]:
-    """Sizes of the observations and actions of each learner."""
-    if joint is not None:
-        of_joint = joint.observation_space, joint.action_space
-        return {JOINT: _learner_spaces(agents, *of_joint, levels)}
-    return {
-        a: _learner_spaces((a,), env.observation_spaces[a], env.action_spaces[a], levels)
-        for a in agents
-    }
-
-
-def _learner_spaces(
-    agents: tuple[str, ...],
-    observation: spaces.Space[Any],
-    action: spaces.Space[Any],
-    levels: int | None,
-) -> LearnerSpaces:
-    choices = levels if isinstance(action, spaces.Box) else CHOICES
-    width, action_width = (int(np.prod(space.shape or (1,))) for space in (observation, action))
-    return LearnerSpaces(agents, width, action_width, choices)
-
-
 def _tensor(array: Any) -> Tensor:
-    """A float32 tensor of its own."""
+    """A float32 copy as a tensor."""
     return torch.from_numpy(np.array(array, dtype=np.float32))

@@ -310,7 +310,7 @@ class _Run:
         }
 
     def _validate(self, weeks: DataCenterWeeks) -> Validation:
-        """Run the policy in the validation weeks, and save it if its figure is the lowest so far."""
+        """Run the policy in the validation weeks, and save it if its figure is lowest so far."""
         policy = self._policy()
         validation = validate(PolicyController(policy, weeks.sim.fleet), weeks)
         if self._best is None or validation.change_pct < self._best.change_pct:
@@ -340,7 +340,7 @@ class _Run:
         return time.perf_counter() - self._begun
 
     def _is_due(self, interval: int) -> bool:
-        """Whether the latest update is the final one, or passed a multiple of ``interval`` steps."""
+        """Whether the last update is the final one, or passed a multiple of ``interval`` steps."""
         if self._update == self._updates:
             return True
         return self._steps // interval > (self._steps - self._steps_each) // interval

@@ -1,12 +1,12 @@
-"""The folder of a training: who may write it, its settings, its curves, and its checkpoint.
+"""The folder of a training: its lock, settings, curves and checkpoint.
 
-Settings are ``settings.yaml``, curves ``training.csv``, ``validation.csv`` and ``tensorboard``. The
-last policy is ``policy``, the one that did best in the validation weeks ``best``, and all that a
-resumed training needs is ``checkpoint.safetensors``.
+Settings are in ``settings.yaml``, curves in ``training.csv``, ``validation.csv`` and
+``tensorboard``. The last policy is in ``policy``, the policy with the best result in the validation
+weeks in ``best``, and everything that a resumed training needs in ``checkpoint.safetensors``.
 
-The state in a checkpoint is made of dicts, lists, tuples, texts, numbers, None, NumPy arrays and
-torch tensors. Its file is one of the format safetensors: arrays and tensors as such, and how they
-are nested, with all that is no array, as JSON in its metadata.
+The state in a checkpoint consists of dicts, lists, tuples, texts, numbers, None, NumPy arrays and
+torch tensors. The file has the format safetensors, with arrays and tensors as its entries, and the
+nesting and all other values as JSON in its metadata.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ LAST_POLICY, BEST_POLICY, EVENTS = "policy", "best", "tensorboard"
 
 @contextlib.contextmanager
 def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[None]:
-    """Keep other processes out of the folder of a training, once it is known to be free.
+    """Check the folder of a training, and lock it against other processes.
 
     Args:
-        out: the folder, made if need be.
+        out: the folder; created if it does not exist and ``resume`` is false.
         settings: settings of the training.
-        resume: whether it is to hold a training with these settings.
+        resume: whether the folder must hold a training with these settings.
 
     Raises:
-        SdcError: it holds other files, no training or one with other settings, another process
-            trains there, or nothing can be written there.
+        SdcError: the folder holds other files, a training to resume is missing or has other
+            settings, another process trains there, or nothing can be written there.
     """
     with naming_errors(out):
         if out.exists() and not out.is_dir():
@@ -80,7 +80,7 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
 
 
 def write_settings(folder: Path, settings: TrainingSettings) -> None:
-    """Write the settings of the training in a folder, which holds a training from then on.
+    """Write the settings of a training, which mark its folder as that of a training.
 
     Raises:
         SdcError: the file cannot be written.
@@ -93,7 +93,7 @@ def settings_of(folder: Path) -> TrainingSettings:
     """Settings of the training in a folder.
 
     Raises:
-        ConfigError: there is none, or they are not valid.
+        ConfigError: the folder holds no training, or the settings are not valid.
     """
     if not (folder / SETTINGS_FILE).is_file():
         raise ConfigError(f"{folder}: holds no training; valid is a folder that train has written")
@@ -101,15 +101,15 @@ def settings_of(folder: Path) -> TrainingSettings:
 
 
 UPDATE = "update"
-"""Column that every row has: the number of the update after which it was written."""
+"""First column of both curves: number of the update after which a row was written."""
 
 
 class CsvLog:
-    """A table that grows by rows; a row with a new column widens it.
+    """A CSV file to which rows are appended; a row with a new column adds it to the table.
 
     Args:
-        path: the file; rows that it has are gone on from.
-        until: last update whose rows are kept; those of later ones are to be written anew.
+        path: the file; it may have rows of an interrupted training.
+        until: last update whose rows stay; rows of later updates are deleted.
 
     Raises:
         SdcError: the file cannot be read or written.
@@ -119,9 +119,9 @@ class CsvLog:
         self._path = path
         self._columns: list[str] = []
         rows = self._read()
-        kept = [row for row in rows if _is_whole(row, self._columns) and int(row[0]) <= until]
-        if kept:
-            self._write(kept)
+        rows = [row for row in rows if _is_complete(row, self._columns) and int(row[0]) <= until]
+        if rows:
+            self._write(rows)
         else:
             self._columns = []
             with naming_errors(path):
@@ -142,14 +142,14 @@ class CsvLog:
             file.write(_line([row.get(name, "") for name in self._columns]))
 
     def _read(self) -> list[list[str]]:
-        """Rows of the file, once its columns are known."""
+        """Rows of the file; also sets the columns."""
         if not self._path.exists():
             return []
         with naming_errors(self._path):
             text = self._path.read_text(encoding="utf-8", errors="replace")
         rows = list(csv.reader(text.splitlines()))
         self._columns = rows[0] if rows else []
-        # A row without its end was being written when the process was killed.
+        # The last row is incomplete if the process was killed while it wrote the row.
         return rows[1:] if text.endswith("\n") else rows[1:-1]
 
     def _write(self, rows: Sequence[Sequence[str]]) -> None:
@@ -164,8 +164,8 @@ class EventLog:
     """TensorBoard events of a training.
 
     Args:
-        folder: folder of the events; None writes none.
-        after: step after which events of an earlier process are void.
+        folder: folder of the events; None writes no events.
+        after: step after which events of an interrupted training are invalid.
 
     Raises:
         SdcError: TensorBoard is not installed, or the folder cannot be written.
@@ -191,7 +191,7 @@ class EventLog:
 
         Args:
             numbers: the numbers.
-            step: steps of all data centers together before them.
+            step: number of steps of all data centers together.
 
         Raises:
             SdcError: the events cannot be written.
@@ -202,7 +202,7 @@ class EventLog:
                     self._writer.add_scalar(name, value, step)
 
     def flush(self) -> None:
-        """Write events that wait.
+        """Write buffered events to the disk.
 
         Raises:
             SdcError: the events cannot be written.
@@ -225,7 +225,7 @@ class EventLog:
                 self._writer.close()
 
 
-def _is_whole(row: Sequence[str], columns: Sequence[str]) -> bool:
+def _is_complete(row: Sequence[str], columns: Sequence[str]) -> bool:
     return len(row) == len(columns) and columns[0] == UPDATE and row[0].isdecimal()
 
 
@@ -243,15 +243,15 @@ Array = npt.NDArray[Any]
 
 
 def write_state(path: Path, state: Any) -> None:
-    """Write a state; readers see the old file until the new one is whole on the disk.
+    """Write a state, replacing the file as a whole.
 
     Args:
-        path: the file; its folder is made if need be.
-        state: what ``read_state`` is to return.
+        path: the file; its folder is created if it does not exist.
+        state: the state, which ``read_state`` returns.
 
     Raises:
         SdcError: the file cannot be written.
-        TypeError: a value of another kind.
+        TypeError: a value has another type than those above.
     """
     from safetensors.numpy import save
 
@@ -268,7 +268,7 @@ def read_state(path: Path) -> Any:
     """Read what ``write_state`` wrote.
 
     Raises:
-        SdcError: no such file, one that was not written by ``write_state``, or a damaged one.
+        SdcError: the file does not exist, was not written by ``write_state``, or is damaged.
     """
     from safetensors import safe_open
 
@@ -287,9 +287,9 @@ def read_state(path: Path) -> Any:
 
 
 def _encode(value: Any, place: str, arrays: dict[str, Array]) -> Any:
-    """A value as JSON has it; numbers of arrays go into ``arrays`` under the name of their place.
+    """A value as JSON; arrays are added to ``arrays`` under the path of their place.
 
-    Whatever JSON lacks is a dict of one key that begins with ``$``.
+    A type that JSON lacks becomes a dict with one key that begins with ``$``.
     """
     if value is None or isinstance(value, bool | str):
         return value
@@ -317,7 +317,7 @@ def _encode(value: Any, place: str, arrays: dict[str, Array]) -> Any:
 
 
 def _decode(node: Any, arrays: Mapping[str, Array]) -> Any:
-    """The value that ``_encode`` was given."""
+    """The value of a node that ``_encode`` made."""
     if isinstance(node, list):
         return [_decode(part, arrays) for part in node]
     if not isinstance(node, dict):
@@ -343,7 +343,7 @@ def _decode(node: Any, arrays: Mapping[str, Array]) -> Any:
 
 
 def _stored(array: Array, place: str, arrays: dict[str, Array]) -> str:
-    """Put an array into ``arrays`` under a new name, and return the name."""
+    """Add an array to ``arrays`` under a new name, and return the name."""
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{place}: states hold no arrays of {array.dtype}")
     name = place if place not in arrays else f"{place}#{len(arrays)}"
