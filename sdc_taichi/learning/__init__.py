@@ -1,8 +1,8 @@
-"""Learning: the algorithms of the paper, their training, and the policies that come out of it.
+"""Learning: the algorithms of the paper, trainings, and trained policies.
 
-An algorithm acts in a stream of environments, learns from it, and hands out networks.
-A policy is a set of networks with a description of the environment that it fits, and a controller.
-PyTorch is needed to train, and not to run a policy.
+An algorithm acts in a stream of environments, learns from it, and returns networks. A policy
+consists of networks and the interface of the environments that it fits, and it is a controller.
+Training needs PyTorch; running a policy does not.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _LAZY = {
 
 
 def require_torch() -> None:
-    """Refuse to train without PyTorch.
+    """Check that PyTorch is installed.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: PyTorch is not installed.
     """
     try:
         import torch  # noqa: F401
@@ -43,5 +43,5 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "train":
         require_torch()
-    globals()[name] = found = getattr(import_module(_LAZY[name]), name)
-    return found
+    globals()[name] = value = getattr(import_module(_LAZY[name]), name)
+    return value

@@ -103,48 +103,47 @@ SETPOINT_CHANGE_K = 0.5
 """Largest change of the setpoint in a step by trained agents, who hold it for some steps, in K."""
 _SHAPE_OF_DAY = ("ci_rank", "ci_relative", "ci_swing")
 _OWN_PARTS = ("default", "bill")
-"""Rewards that pay each agent for its own part, to which those of others would add noise."""
+"""Rewards that pay each agent for its own part; sharing rewards would add noise."""
 _PRICES = ("price", "price_forecast")
 
 
-def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of environments that trainings have beneath those given.
+def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Default options of environments for trainings, below the options that are set.
 
-    Actions are continuous, and agents observe the shape of the coming day by the hour: the carbon
-    intensity in relation to its own range, and with rewards of the bill the price.
+    Actions are continuous, and agents observe the hourly shape of the coming day: the carbon
+    intensity relative to its range and, with rewards ``bill``, the price.
 
     Args:
-        given: options that the user or a scenario gives, by name.
+        options: options that the user or a scenario sets, by name.
     """
-    agents, commands = given.get("agents") or AGENTS, given.get("commands") or {}
-    # What is not valid here is refused with all other options.
+    agents, commands = options.get("agents") or AGENTS, options.get("commands") or {}
+    # Invalid values are refused later, together with those of all other options.
     agents = [x for x in agents if x in AGENTS] if isinstance(agents, list | tuple) else []
     commands = commands if isinstance(commands, Mapping) else {}
-    found: dict[str, Any] = {}
-    if given.get("actions", "continuous") == "continuous":
-        found["actions"] = "continuous"
+    defaults: dict[str, Any] = {}
+    if options.get("actions", "continuous") == "continuous":
+        defaults["actions"] = "continuous"
         decided = commands.get("agent_dc", ("cooling",))
         moves_setpoint = isinstance(decided, list | tuple) and "cooling" in decided
         if "agent_dc" in agents and moves_setpoint:
-            found["setpoint_change_k"] = SETPOINT_CHANGE_K
-    if given.get("rewards", "default") in _OWN_PARTS:
-        found["collaboration"] = 1.0
-    if given.get("observations", "default") == "default":
-        found["ci_leads_h"] = CI_LEADS_H
+            defaults["setpoint_change_k"] = SETPOINT_CHANGE_K
+    if options.get("rewards", "default") in _OWN_PARTS:
+        defaults["collaboration"] = 1.0
+    if options.get("observations", "default") == "default":
+        defaults["ci_leads_h"] = CI_LEADS_H
         if not commands:
-            found["features"] = {agent: _features(agent, given) for agent in agents}
-    return found
+            defaults["features"] = {agent: _features(agent, options) for agent in agents}
+    return defaults
 
 
-def _features(agent: str, given: Mapping[str, Any]) -> tuple[str, ...]:
-    """Features of an agent: its default ones, but for forecasts that others tell better."""
+def _features(agent: str, options: Mapping[str, Any]) -> tuple[str, ...]:
+    """Default features of an agent, with hourly forecasts in place of those they replace."""
     names = AGENT_DEFINITIONS[agent].features
     if agent == "agent_dc":
-        kept = [name for name in names if name != "ci_forecast"]
-        return (*kept, "queue")
-    kept = [name for name in names if name not in ("ci_forecast", "ci_change")]
-    prices = _PRICES if given.get("rewards") == "bill" else ()
-    return (*kept, *_SHAPE_OF_DAY, *prices)
+        return (*(name for name in names if name != "ci_forecast"), "queue")
+    names = tuple(name for name in names if name not in ("ci_forecast", "ci_change"))
+    prices = _PRICES if options.get("rewards") == "bill" else ()
+    return (*names, *_SHAPE_OF_DAY, *prices)
 
 
 MOST_STEPS = 10**12
@@ -223,7 +222,7 @@ class TrainingSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _on_top_of_scenario(cls, values: Any) -> Any:
-        """Put the values given on top of those of their scenario and of all trainings."""
+        """Merge the values with those of their scenario and the defaults of all trainings."""
         if not isinstance(values, Mapping):
             return values
         name = values.get("scenario")
@@ -231,12 +230,12 @@ class TrainingSettings(Section):
             if name not in SCENARIOS:
                 raise ValueError(f"scenario {name!r}{suggestion_or_valid(name, SCENARIOS)}")
             values = merged(SCENARIOS[name], values)
-        given = values.get("environment") or {}
-        if isinstance(given, EnvOptions):
-            given = _given(given)
-        if not isinstance(given, Mapping):
+        options = values.get("environment") or {}
+        if isinstance(options, EnvOptions):
+            options = _set_options(options)
+        if not isinstance(options, Mapping):
             return values
-        return merged({"environment": training_environment(given)}, values)
+        return merged({"environment": training_environment(options)}, values)
 
     @field_validator("algorithm")
     @classmethod
@@ -284,17 +283,17 @@ class TrainingSettings(Section):
     def _plain(cls, value: EnvOptions) -> EnvOptions:
         """Refuse objects, which cannot be written down."""
         for name in value.model_fields_set:
-            given = getattr(value, name)
-            if callable(given) or (name == "others" and not isinstance(given, str)):
+            option = getattr(value, name)
+            if callable(option) or (name == "others" and not isinstance(option, str)):
                 raise ValueError(
-                    f"{name}: {type(given).__name__}; valid in settings is its name, or its path "
+                    f"{name}: {type(option).__name__}; valid in settings is its name, or its path "
                     "module:name"
                 )
         return value
 
     @field_serializer("environment")
-    def _options_given(self, value: EnvOptions) -> dict[str, Any]:
-        """The options that were given: some of the others would be errors, or follow from them."""
+    def _options_set(self, value: EnvOptions) -> dict[str, Any]:
+        """The options that were set: others would be errors, or follow from these."""
         dumped = value.model_dump(mode="json", exclude_unset=True)
         follow = json.loads(json.dumps(training_environment(dumped)))
         return {k: v for k, v in dumped.items() if k not in follow or v != follow[k]}
@@ -303,10 +302,10 @@ class TrainingSettings(Section):
     def _weeks_fit_episodes(self) -> Self:
         if self.weeks is None:
             return self
-        given = [name for name in _FIXED_BY_WEEKS if name in self.environment.model_fields_set]
-        if given:
+        names = [name for name in _FIXED_BY_WEEKS if name in self.environment.model_fields_set]
+        if names:
             raise ValueError(
-                f"environment.{given[0]}: without effect with weeks; valid with weeks null"
+                f"environment.{names[0]}: without effect with weeks; valid with weeks null"
             )
         if self.environment.days > DAYS_PER_WEEK:
             raise ValueError(
@@ -323,10 +322,7 @@ class TrainingSettings(Section):
         """Options of the environments, with the first days that ``weeks`` fixes."""
         if self.weeks is None:
             return self.environment
-        given = {
-            name: getattr(self.environment, name) for name in self.environment.model_fields_set
-        }
-        return EnvOptions.model_validate(given | {"start": "fixed"})
+        return EnvOptions.model_validate(_set_options(self.environment) | {"start": "fixed"})
 
     def _config(self) -> DataCenterConfig:
         """The data center, with its overrides, before sites and weeks."""
@@ -438,16 +434,16 @@ def whole_steps(value: Any) -> Any:
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Values on top of others, section by section.
+    """Values with some of them replaced, section by section.
 
     Args:
-        base: values beneath.
-        over: values that take their place; a section may be an object.
+        base: the values.
+        over: values that replace those of ``base``; a section may be an object.
     """
     out = dict(base)
     for key, value in over.items():
         if isinstance(value, EnvOptions):
-            value = _given(value)
+            value = _set_options(value)
         old = out.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping):
             value = merged(old, value)
@@ -455,8 +451,8 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _given(options: EnvOptions) -> dict[str, Any]:
-    """Options that were given; some of the others would be errors."""
+def _set_options(options: EnvOptions) -> dict[str, Any]:
+    """Options that were set explicitly, by name; setting others could be an error."""
     return {name: getattr(options, name) for name in options.model_fields_set}
 
 
