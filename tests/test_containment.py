@@ -23,15 +23,17 @@ FLOW_MODELS = ("constant", "follow_servers", "controlled")
 
 def simulated(config: DataCenterConfig, supply_c: float, load: float = 1.0) -> HallSums:
     """Air of a hall whose CRAC units run as they do in a step of the simulator."""
-    fleet = fleet_of(config)
+    return simulated_at(config, supply_c, np.array([load]))
+
+
+def simulated_at(config: DataCenterConfig, supply_c: float, loads: F64) -> HallSums:
+    """Air of a hall at each of some loads."""
+    fleet = fleet_of(*[config] * len(loads))
     supply = CracUnits(fleet, UnitIndex(fleet)).initial_supply()
-    met = Conditions(
-        np.full(fleet.units, supply_c),
-        np.array([load]),
-        unit_low=supply.unit_low,
-        unit_high=supply.unit_high,
+    conditions = Conditions(
+        np.full(fleet.units, supply_c), loads, unit_low=supply.unit_low, unit_high=supply.unit_high
     )
-    return Hall(fleet, "f64").solve(met)
+    return Hall(fleet, "f64").solve(conditions)
 
 
 def assert_at_design(shown: DesignHall, sums: HallSums) -> None:
@@ -93,15 +95,9 @@ def test_hottest_inlet_is_continuous_in_load(
     config = load_config(
         "corrected", [f"hall.layout.containment={containment}", f"hvac.crac.units={units}"]
     )
-    loads = np.linspace(0.0, 1.0, 401)
-    fleet = fleet_of(*[config] * len(loads))
-    supply = CracUnits(fleet, UnitIndex(fleet)).initial_supply()
-    met = Conditions(
-        np.full(fleet.units, supply_c), loads, unit_low=supply.unit_low, unit_high=supply.unit_high
-    )
-    found: F64 = Hall(fleet, "f64").solve(met).inlet_max_c
+    inlets_c = simulated_at(config, supply_c, np.linspace(0.0, 1.0, 401)).inlet_max_c
     # A quarter of a percent of load; without containment inlets rise by 10 K over all of it.
-    assert np.max(np.abs(np.diff(found))) < 0.1
+    assert np.max(np.abs(np.diff(inlets_c))) < 0.1
 
 
 @pytest.mark.parametrize("highest_c", [19.0, 23.0, 27.0])
