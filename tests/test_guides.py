@@ -25,18 +25,23 @@ pytestmark = pytest.mark.repo
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-GUIDES = [
-    DOCS / "index.md",
-    *(x for x in sorted(DOCS.glob("how-to/*.md")) if x.stem != "index"),
+HOW_TO = DOCS / "how-to.md"
+WHOLE_GUIDES = [
+    *DOCS.glob("index.md"),
     *(x for x in sorted(DOCS.glob("tutorials/*.md")) if x.stem != "index"),
 ]
-"""Pages whose commands are run as they stand."""
+GUIDES = {page.stem: page.read_text("utf-8") for page in WHOLE_GUIDES} | {
+    answer.partition("\n")[0]: answer
+    for page in DOCS.glob("how-to.md")
+    for answer in re.split("^## ", page.read_text("utf-8"), flags=re.M)[1:]
+}
+"""Texts whose commands are run as they stand: pages, and each answer of the how-to guides."""
 PAGES = [
     ROOT / "README.md",
     *(
         page
         for page in sorted(DOCS.rglob("*.md"))
-        if page not in GUIDES and "site" not in page.relative_to(DOCS).parts
+        if page not in (*WHOLE_GUIDES, HOW_TO) and "site" not in page.relative_to(DOCS).parts
     ),
 ]
 """Pages whose Python is run, and whose commands have to be valid."""
@@ -61,8 +66,13 @@ class Shown(NamedTuple):
 
 def shown_on(page: Path) -> list[Shown]:
     """Python and indented lines of a page in their order."""
+    return shown_in(page.read_text("utf-8"))
+
+
+def shown_in(text: str) -> list[Shown]:
+    """Python and indented lines of a text in their order."""
     found = []
-    content = _SYNOPSIS.sub("", page.read_text("utf-8"))
+    content = _SYNOPSIS.sub("", text)
     is_run = True
     for part in re.split(r"(^```.*?^```$)", content, flags=re.M | re.S):
         if part.startswith("```python\n"):
@@ -93,18 +103,18 @@ def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("guide", GUIDES)
 def test_what_a_guide_shows_runs(
-    page: Path, there: Path, capsys: pytest.CaptureFixture[str]
+    guide: str, there: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names: dict[str, Any] = {}
-    shown = shown_on(page)
+    shown = shown_in(GUIDES[guide])
     for kind, code, _ in shown:
         if kind == "python":
-            exec(compile(inspect.cleandoc(code), str(page), "exec"), names)
+            exec(compile(inspect.cleandoc(code), guide, "exec"), names)
         else:
             run(code)
-    assert shown or page.stem in ("cite", "run-in-a-container")
+    assert shown or guide in ("Cite", "Run in a container")
 
 
 def run(line: str) -> None:
@@ -166,7 +176,7 @@ def commands_on(page: Path) -> Iterator[list[str]]:
 
 
 def test_pages_show_commands() -> None:
-    """The expression that finds them finds most."""
+    """The expression that looks for commands finds most of them."""
     assert sum(1 for page in PAGES for _ in commands_on(page)) > 130
 
 
