@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -708,19 +706,6 @@ def test_recordings_that_have_ended_leave_no_threads(tmp_path: Path, theirs: boo
     assert (after_others > after_one + 12) == theirs
     assert global_stays == "True"
     assert len(list(tmp_path.iterdir())) == 14
-
-
-@pytest.mark.repo
-def test_benchmark_measures_the_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    script = str(Path(__file__).parent.parent / "benchmarks" / "recording.py")
-    monkeypatch.setattr(sys, "argv", [script, "--quick", "--out", str(tmp_path)])
-    runpy.run_path(script, run_name="__main__")
-    (row,) = json.loads((tmp_path / "recording.json").read_text(encoding="utf-8"))
-    assert row["ratio"] == pytest.approx(row["on_us"] / row["off_us"])
-    assert min(row["on_us"], row["off_us"]) > 0
-    assert row["file_mb"] > 0.1
-    assert row["memory_mb"] > 10, "rerun-sdk at the least"
-    assert row["name"] in (tmp_path / "recording.md").read_text(encoding="utf-8")
 
 
 def test_missing_rerun_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F32, F64, I64, Reals, Status, StepResult
 
 from . import hall_rasters as rasters
-from .recording_series import AGE_EDGES_H, FIELD_ROWS, FIELDS, FLEET_SUMS
+from .recording_series import AGE_EDGES_H, FIELD_ROWS, FIELDS, FLEET_SUMS, Cadence
 from .recording_text import LogEntry, failure_entries, hottest_server, protection_entries
 
 if TYPE_CHECKING:
@@ -43,24 +43,6 @@ HOTTEST_FIELDS = ("inlet_max_c", "hottest_rack", "hottest_server")
 _UNREDUCED_BYTES = 4_000_000
 """Size of the results that wait until they are reduced to the data centers in focus; it fits into
 the cache that processors share."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cadence:
-    """How often heat maps and 3D halls are recorded, and how finely."""
-
-    map_every_steps: int
-    """Steps between two heat maps."""
-    hall_every_steps: int
-    """Steps between two frames of the 3D hall."""
-    hall_every_steps_in_events: int
-    """Steps between two frames of the 3D hall while a failure or weather event lasts."""
-    levels: tuple[int, ...]
-    """Levels per rack of the 3D hall of each data center in focus."""
-    has_servers: bool
-    """Whether levels show servers; else a rack shows its hottest inlet and its mean outlet."""
-    block_steps: int
-    """Number of steps in a block."""
 
 
 def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) -> Cadence:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,24 @@ PALETTE = (BLUE, ORANGE, GREEN, RED, PINK, SKY, YELLOW, GREY)
 
 AGE_EDGES_H = (0.0, 6.0, 12.0, 24.0)
 """Lower edges of the age bands of the queue, in h; the last band has no upper edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cadence:
+    """How often heat maps and 3D halls are recorded, and how finely."""
+
+    map_every_steps: int
+    """Steps between two heat maps."""
+    hall_every_steps: int
+    """Steps between two frames of the 3D hall."""
+    hall_every_steps_in_events: int
+    """Steps between two frames of the 3D hall while a failure or weather event lasts."""
+    levels: tuple[int, ...]
+    """Levels per rack of the 3D hall of each data center in focus."""
+    has_servers: bool
+    """Whether levels show servers; else a rack shows its hottest inlet and its mean outlet."""
+    block_steps: int
+    """Number of steps in a block."""
 
 
 class PlotLine(NamedTuple):

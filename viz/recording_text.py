@@ -31,7 +31,7 @@ from .hall_rasters import ColourScale
 from .recording_series import FIELD_ROWS
 
 if TYPE_CHECKING:
-    from .recording_blocks import Cadence
+    from .recording_series import Cadence
 
 MAX_RACKS_PER_STEP = 8
 """Largest number of racks named when those of a data center change status in one step."""
