@@ -408,7 +408,6 @@ def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.Mo
         (EpisodeRecorder("run.rrd", every=0), "every 0: valid is a positive integer"),
         (EpisodeRecorder(Recorder("run.rrd"), every=3), "without effect on a Recorder"),
     ],
-    ids=str,
 )
 def test_malformed_recorders(recorder: Any, message: str) -> None:
     with pytest.raises(SdcError, match=message):
