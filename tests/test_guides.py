@@ -177,7 +177,7 @@ def commands_on(page: Path) -> Iterator[list[str]]:
 
 def test_pages_show_commands() -> None:
     """The expression that looks for commands finds most of them."""
-    assert sum(1 for page in PAGES for _ in commands_on(page)) > 80
+    assert sum(1 for page in PAGES for _ in commands_on(page)) > 50
 
 
 PYTHON_PAGES = [
