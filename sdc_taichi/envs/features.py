@@ -144,7 +144,7 @@ class Design(NamedTuple):
 class Measurements(NamedTuple):
     """Inputs of features that are measured in the data center, (B,) each.
 
-    Their functions are compiled: arithmetic, the NumPy functions of ``kernels/compiler/trace.py``,
+    Their functions are compiled: arithmetic, the NumPy functions of ``kernels/compiler/stage.py``,
     and ``np.where`` in place of branches.
     """
 

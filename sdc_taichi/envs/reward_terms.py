@@ -25,7 +25,7 @@ true series, even if agents observe forecasts with errors.
 
 To add a term, write a function with the decorator ``reward_term``; its name is the name of the
 term, and the first line of its docstring describes it in the documentation. Terms are compiled
-together, so they use arithmetic, the NumPy functions of ``kernels/compiler/trace.py``, and
+together, so they use arithmetic, the NumPy functions of ``kernels/compiler/stage.py``, and
 ``np.where`` instead of branches on values. A quantity that is not in the result of a step needs a
 field in ``TermContext`` and its value in ``RewardContext``.
 """
