@@ -38,7 +38,7 @@ from sdc_taichi.run.optimum_folder import (
     write_optimum,
 )
 from sdc_taichi.viz import report
-from sdc_taichi.viz.report_optimum import known_optimum, optimum_section
+from sdc_taichi.viz.report_pictures import known_optimum, optimum_section
 
 STEPS = 120
 SITES = ["NY", "CA"]

@@ -29,7 +29,7 @@ from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_text import hottest_markdown
-from sdc_taichi.viz.report_sections import hot_racks_section
+from sdc_taichi.viz.report import hot_racks_section
 
 FAILURES = (
     "hvac.crac.units=4",

@@ -41,7 +41,6 @@ from sdc_taichi.viz import (
     report_html,
     report_metrics,
     report_pictures,
-    report_sections,
 )
 from sdc_taichi.viz.plotting import format_number
 
@@ -240,7 +239,7 @@ def many_events(run: folder_reader.RunFolder) -> folder_reader.RunFolder:
 
 
 def test_many_events_are_told_by_kind(folder: Path) -> None:
-    page = read_page(report_sections.events_section(many_events(read_run(folder / "greedy"))))
+    page = read_page(report.events_section(many_events(read_run(folder / "greedy"))))
     name = NASTY
     assert page.tables[0][1:] == [
         ["crac down", "30", "1", "15", "28 February 01:00 in ny"],
@@ -316,7 +315,7 @@ def test_equal_runs_give_equal_bytes(folder: Path, html: str) -> None:
     run = read_run(folder / "greedy")
     dc = report_pictures.shown_data_centers(run)[0]
     for text in (
-        report_sections.summary_section(run),
+        report.summary_section(run),
         report_metrics.metrics_section(run),
         report_pictures.fleet_section(run),
     ):
@@ -367,10 +366,10 @@ def test_files_are_named_with_their_hashes(folder: Path) -> None:
     for dc in run.metrics["data_centers"]:
         dc["provenance"]["weather"] = "LGA.epw"
         dc["sha256"] = {"weather": digest, "recirculation": digest}
-    page = read_page(report_sections.provenance_section(run))
+    page = read_page(report.provenance_section(run))
     assert page.rows("weather") == [["weather", "LGA.epw", digest, f"ny, {NASTY}"]]
     assert page.rows("recirculation")[0][2] == digest
-    assert "SYNTHETIC" not in read_page(report_sections.summary_section(run)).text
+    assert "SYNTHETIC" not in read_page(report.summary_section(run)).text
 
 
 @pytest.fixture(scope="module")

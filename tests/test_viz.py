@@ -22,7 +22,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.viz import figures, step_panels
+from sdc_taichi.viz import figures
 
 STEPS = 110  # more than a block, and no multiple of one
 ODD_NAME = "hall/1 [a]"
@@ -165,7 +165,7 @@ def test_overview_shows_the_run(run: tuple[Simulator, list[StepResult]]) -> None
         ((steps["it_w"] + steps["hvac_w"]) / 1e3).max()
     )
     assert [area.get_label() for area in power.collections] == [
-        name for name, _ in step_panels.POWERS.values()
+        name for name, _ in figures.POWERS.values()
     ]
     assert not power.lines
     np.testing.assert_array_equal(carbon.lines[0].get_ydata()[:-1], steps["ci_g_per_kwh"])

@@ -18,8 +18,10 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C, rank
 from sdc_taichi.types import F64
 
+from .figures import PANEL_COLUMNS, draw_carbon, draw_power, draw_storage
 from .plotting import (
     BLUE,
+    DAY,
     GREEN,
     GREY,
     MAX_LABELLED_RACKS,
@@ -32,10 +34,13 @@ from .plotting import (
     date_text,
     draw_rack_grid,
     draw_steps,
+    format_day_axis,
     format_time_axis,
+    is_over_a_year,
     literal_text,
     new_figure,
     outline_hottest,
+    rows_of_day,
     scale_thousands,
     short_name,
     step_edges,
@@ -43,7 +48,6 @@ from .plotting import (
     style_axes,
     style_axes_with_legend,
 )
-from .step_panels import COLUMNS, draw_carbon, draw_power, draw_storage
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,7 +93,6 @@ EVENT_SHADES = {
     "heat_wave": ("#B8A800", "--"),
 }
 """Colour and hatching of events by kind; grid outages are shaded by the column ``grid_up``."""
-_DAY = np.timedelta64(1, "D")
 
 
 def day(
@@ -108,14 +111,12 @@ def day(
     Raises:
         SdcError: matplotlib or a column is missing, or the run does not have the day.
     """
-    from matplotlib.dates import DateFormatter, HourLocator
-
     figure = new_figure(12.0, 12.0)
-    check_steps(steps, COLUMNS)
+    check_steps(steps, PANEL_COLUMNS)
     check_steps(steps, ("time", *DAY_COLUMNS))
     first, after = rows_of_day(steps, date)
     shown = steps.iloc[first:after]
-    check_steps(shown, COLUMNS)
+    check_steps(shown, PANEL_COLUMNS)
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 3, 2, 3])
     _draw_day_temperatures(panels[0], shown, events)
     draw_power(panels[1], shown)
@@ -123,12 +124,7 @@ def day(
     _draw_commands(panels[3], shown)
     # The day begins with the storage that the step before left.
     draw_storage(panels[4], steps.iloc[max(first - 1, 0) : after])
-    panels[-1].xaxis.set_major_locator(HourLocator(range(0, 24, 3)))  # type: ignore[no-untyped-call]
-    panels[-1].xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
-    begin = shown["time"].iloc[0].normalize()
-    panels[-1].set_xlim(begin, begin + _DAY)
-    name = date_text(begin, over_a_year=is_over_a_year(steps))
-    panels[-1].set_xlabel(f"local standard time on {name}")
+    format_day_axis(panels[-1], shown, over_a_year=is_over_a_year(steps))
     add_title(figure, short_name(title))
     return figure
 
@@ -299,33 +295,6 @@ def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
     return figure
 
 
-def is_over_a_year(steps: pd.DataFrame) -> bool:
-    """Whether a run is longer than a year, so that its days occur more than once."""
-    return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * _DAY)
-
-
-def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
-    """First row of a day, and the first row after it.
-
-    Args:
-        steps: steps of the data center.
-        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
-
-    Raises:
-        SdcError: the run does not have the day.
-    """
-    days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
-    names = [str(each) for each in days]
-    found = [i for i, name in enumerate(names) if date in (name, name[-5:])]
-    if not found:
-        raise SdcError(
-            f"date {date!r}: valid is MM-DD of a day of the run, "
-            f"{names[0][-5:]} to {names[-1][-5:]} ({len(days)} days)"
-        )
-    rows = [*map(int, first), len(steps)]
-    return rows[found[0]], rows[found[0] + 1]
-
-
 def _draw_day_temperatures(
     axes: Axes, steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> None:
@@ -408,10 +377,10 @@ def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: st
     dates = moments.astype("datetime64[D]")
     interval = moments[1] - moments[0]
     slots = (moments - dates) // interval
-    columns = ((dates - dates[0]) / _DAY).astype(np.int64)
-    shown = np.full((int(_DAY // interval), columns[-1] + 1), np.nan)
+    columns = ((dates - dates[0]) / DAY).astype(np.int64)
+    shown = np.full((int(DAY // interval), columns[-1] + 1), np.nan)
     shown[slots, columns] = values
-    span = [float(date2num(d)) for d in (dates[0], dates[-1] + _DAY)]  # type: ignore[no-untyped-call]
+    span = [float(date2num(d)) for d in (dates[0], dates[-1] + DAY)]  # type: ignore[no-untyped-call]
     image = axes.imshow(
         np.ma.masked_invalid(shown),
         aspect="auto",

@@ -1,35 +1,51 @@
-"""Pictures of results: rack temperatures of a hall at one step, and a run over time.
+"""Pictures of a hall in one step, of a run over time, and of one day under several controllers.
 
-``hall_map`` and ``overview`` return a ``matplotlib.figure.Figure``, which ``figure.savefig(path)``
-writes.
+Functions for users return a ``matplotlib.figure.Figure``; ``figure.savefig(path)`` writes it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.exogenous.year_clock import day_of_year, step_times
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import Reals, StepResult
+from sdc_taichi.types import F64, Reals, StepResult
 
 from .plotting import (
+    BLUE,
+    GREEN,
+    GREY,
+    LINE_COLOURS,
     MAX_LABELLED_RACKS,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
     add_title,
     check_steps,
     colour_range,
     draw_rack_grid,
+    draw_steps,
+    format_day_axis,
     format_time_axis,
+    is_over_a_year,
+    literal_text,
     new_figure,
     outline_hottest,
+    repeat_last,
+    rows_of_day,
     short_name,
+    step_edges,
+    step_hours,
+    style_axes,
+    style_axes_with_legend,
 )
-from .step_panels import COLUMNS, draw_carbon, draw_power, draw_storage, draw_temperatures
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,7 +108,7 @@ def overview(steps: pd.DataFrame) -> Figure:
             not increase.
     """
     figure = new_figure(12.0, 9.0)
-    check_steps(steps, COLUMNS)
+    check_steps(steps, PANEL_COLUMNS)
     draws = (draw_temperatures, draw_power, draw_carbon, draw_storage)
     all_axes = figure.subplots(4, 1, sharex=True, height_ratios=[3, 4, 3, 3])
     for axes, draw in zip(all_axes, draws, strict=True):
@@ -144,3 +160,180 @@ def draw_hall(axes: Axes, quantity: str, result: StepResult, fleet: Fleet, dc: i
     axes.set_title(title, fontsize=10, loc="left")
     ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
     axes.figure.colorbar(image, ax=axes, label=f"{quantity} (°C)", ticks=ticks)
+
+
+POWERS = {
+    "it_w": ("IT", BLUE),
+    "chiller_w": ("chiller", ORANGE),
+    "tower_fan_w": ("tower fan", SKY),
+    "chilled_pump_w": ("chilled-water pump", GREEN),
+    "condenser_pump_w": ("condenser pump", PINK),
+    "crac_fan_w": ("CRAC fan", RED),
+}
+"""Powers that are stacked: from the column to its name and colour."""
+
+PANEL_COLUMNS = (
+    "time",
+    "outdoor_c",
+    "wet_bulb_c",
+    "setpoint_c",
+    *POWERS,
+    "overhead_w",
+    "ci_g_per_kwh",
+    "carbon_g",
+    "queue_tasks",
+    "soc",
+)
+"""Columns of steps.parquet that the panels read."""
+
+
+def draw_temperatures(axes: Axes, steps: pd.DataFrame) -> None:
+    """Draw outdoor temperature, wet bulb and setpoint."""
+    for name, colour, label in (
+        ("outdoor_c", RED, "outdoor"),
+        ("wet_bulb_c", SKY, "wet bulb"),
+        ("setpoint_c", "black", "setpoint"),
+    ):
+        draw_steps(axes, steps, steps[name], color=colour, linewidth=1.2, label=label)
+    axes.set_ylabel("temperature (°C)")
+    style_axes_with_legend(axes)
+
+
+def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
+    """Draw power by device, stacked."""
+    powers = [steps[column] / 1e3 for column in POWERS]
+    axes.stackplot(
+        step_edges(steps),
+        [repeat_last(power) for power in powers],
+        labels=[name for name, _ in POWERS.values()],
+        colors=[colour for _, colour in POWERS.values()],
+        linewidth=0,
+        step="post",
+    )
+    counted = (steps["it_w"] + steps["overhead_w"]) / 1e3
+    # Presets may leave devices out of the HVAC total.
+    if not np.allclose(counted, sum(powers), rtol=1e-6):
+        draw_steps(axes, steps, counted, color="black", linewidth=1.2, label="counted in total")
+    axes.set_ylabel("power (kW)")
+    axes.set_ylim(bottom=0)
+    style_axes_with_legend(axes)
+
+
+def draw_carbon(axes: Axes, steps: pd.DataFrame) -> None:
+    """Draw carbon intensity, and emissions behind it."""
+    emitted = axes.twinx()
+    kg_per_h = steps["carbon_g"] / 1e3 / step_hours(steps)
+    emitted.fill_between(step_edges(steps), repeat_last(kg_per_h), color=GREY, alpha=0.35,
+                         linewidth=0, step="post")  # fmt: skip
+    emitted.set_ylabel("emitted (kg CO₂e/h)", color=GREY)
+    emitted.set_ylim(bottom=0)
+    draw_steps(axes, steps, steps["ci_g_per_kwh"], color=RED)
+    axes.set_ylabel("carbon intensity\n(g CO₂e/kWh)", color=RED)
+    _put_in_front(axes, emitted)
+
+
+def draw_storage(axes: Axes, steps: pd.DataFrame) -> None:
+    """Draw queue and battery charge at the ends of the steps, for which they stand."""
+    ends = step_edges(steps)[1:]
+    charge = axes.twinx()
+    charge.fill_between(ends, 100 * steps["soc"], color=GREEN, alpha=0.3, linewidth=0)
+    charge.set_ylabel("battery charge (%)", color=GREEN)
+    charge.set_ylim(0, 100)
+    axes.plot(ends, steps["queue_tasks"], color=PINK, linewidth=1.4)
+    axes.set_ylabel("queue (tasks)", color=PINK)
+    axes.set_ylim(0, 1.05 * max(1.0, steps["queue_tasks"].max()))
+    _put_in_front(axes, charge)
+
+
+def _put_in_front(axes: Axes, behind: Axes) -> None:
+    """Draw axes in front of their twin."""
+    axes.set_zorder(behind.get_zorder() + 1)
+    axes.patch.set_visible(False)
+    behind.spines[:].set_visible(False)
+    style_axes(axes)
+
+
+OPTIMUM_COLUMNS = ("time", "ci_g_per_kwh", "price_per_kwh", "utilisation", "setpoint_c", "soc")
+"""Columns of steps.parquet that the picture reads."""
+IDLE = "idle"
+"""Label that is drawn in grey."""
+
+
+def optimum_day(
+    steps_of: Mapping[str, pd.DataFrame], date: str, title: str = "", *, by_price: bool = False
+) -> Figure:
+    """What grid, load, setpoint and battery do over a day under each of some controllers.
+
+    Args:
+        steps_of: steps of one data center under each controller, by label.
+        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
+        title: written above, such as the name of the data center.
+        by_price: whether to draw the price of a kWh in place of its carbon intensity.
+
+    Raises:
+        SdcError: matplotlib or a column is missing, runs of other times, or without the day.
+    """
+    figure = new_figure(11.0, 9.0)
+    first = next(iter(steps_of.values()))
+    for label, steps in steps_of.items():
+        check_steps(steps, OPTIMUM_COLUMNS)
+        if not np.array_equal(steps["time"], first["time"]):
+            raise SdcError(f"steps of {label}: of other times than the first")
+    rows = rows_of_day(first, date)
+    panels = figure.subplots(4, 1, sharex=True, height_ratios=[2, 3, 3, 3])
+    shown = first.iloc[slice(*rows)]
+    check_steps(shown, OPTIMUM_COLUMNS)
+    column, label = (
+        ("price_per_kwh", "price of a kWh\n(currency)")
+        if by_price
+        else ("ci_g_per_kwh", "carbon intensity\n(g CO₂e/kWh)")
+    )
+    draw_steps(panels[0], shown, shown[column], color=RED)
+    panels[0].set_ylabel(label)
+    style_axes(panels[0])
+    _draw_controllers(panels[1:], steps_of, rows)
+    panels[1].set_ylabel("utilisation (%)")
+    panels[2].set_ylabel("setpoint (°C)")
+    panels[3].set_ylabel("battery charge (%)")
+    panels[3].set_ylim(-3, 103)
+    style_axes_with_legend(panels[1])
+    style_axes(panels[2])
+    style_axes(panels[3])
+    format_day_axis(panels[-1], shown, over_a_year=is_over_a_year(first))
+    add_title(figure, short_name(title))
+    return figure
+
+
+def day_of_most_saved(saved: F64, times: pd.Series) -> str:
+    """Day on which most is saved, YYYY-MM-DD, the first if several are equal.
+
+    Args:
+        saved: what is saved in each step.
+        times: times at which the steps begin.
+    """
+    days = times.dt.strftime("%Y-%m-%d").to_numpy()
+    names, of_step = np.unique(days, return_inverse=True)
+    # Rounded, because sums of equal days may differ in their last digits.
+    sums = np.bincount(of_step, weights=saved)
+    steps = np.bincount(of_step)
+    # Days that the run has in part are shown only where there are no others.
+    whole = np.where(steps == steps.max(), sums, -np.inf)
+    return str(names[int(np.argmax(np.round(whole, 6)))])
+
+
+def _draw_controllers(
+    panels: list[Axes], steps_of: Mapping[str, pd.DataFrame], rows: tuple[int, int]
+) -> None:
+    """Draw utilisation, setpoint and battery charge under each controller."""
+    colours = iter(LINE_COLOURS * len(steps_of))
+    first, after = rows
+    for index, (label, steps) in enumerate(steps_of.items()):
+        colour = GREY if label == IDLE else next(colours)
+        style: dict[str, Any] = {"color": colour, "linewidth": 1.3, "label": literal_text(label)}
+        style["zorder"] = 2 + index
+        shown = steps.iloc[first:after]
+        draw_steps(panels[0], shown, 100.0 * shown["utilisation"], **style)
+        draw_steps(panels[1], shown, shown["setpoint_c"], **style)
+        # The day begins with what the step before left.
+        before = steps.iloc[max(first - 1, 0) : after]
+        panels[2].plot(step_edges(before)[1:], 100.0 * before["soc"], **style)

@@ -1,9 +1,9 @@
-"""Pictures of many data centers, and of several runs side by side."""
+"""Pictures of many data centers, and of runs side by side: radar, best values, benchmarks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from .plotting import (
     GREY,
     ORANGE,
     RED,
+    add_title,
     colour_range,
     draw_steps,
     format_number,
@@ -36,6 +37,8 @@ from .plotting import (
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
 RADAR_METRICS = (
@@ -222,3 +225,151 @@ def _centre_pct(share_pct: F64) -> float:
     """The highest of ``CENTRES_PCT`` that leaves a quarter of the axis below the best value."""
     best = float(share_pct.min())
     return next(c for c in CENTRES_PCT if best >= c + 0.25 * (100.0 - c) or c == 0.0)
+
+
+MOST_PANELS = 12
+"""Largest number of panels of a picture."""
+_COLUMNS = 4
+"""Largest number of panels beside each other."""
+_LEAST_PCT, _MOST_PCT = 0.1, 20.0
+"""Least and largest value at the end of the colour bar, in %."""
+
+
+class MonthlyFigures(NamedTuple):
+    """A metric of one data center in M months at V values of a field."""
+
+    name: str
+    """Name of the data center, such as its site."""
+    months: Sequence[int]
+    """Months, 1..12, M of them."""
+    values: F64
+    """Values of the field, in ascending order, (V,)."""
+    figures: F64
+    """The metric, of which less is better, (M, V)."""
+
+
+def plot_best_values(
+    panels: Sequence[MonthlyFigures], field: str, metric: str, default: float | None
+) -> Figure:
+    """Draw how far the metric is above its least in each month, a panel for each data center.
+
+    A dot is the best value of a month, the full line the best fixed value of all months, the dashed
+    one the value of the config. Of more than ``MOST_PANELS`` data centers the first are drawn.
+
+    Args:
+        panels: the figures of each data center.
+        field: name of the field.
+        metric: name of the metric.
+        default: value of the config; None if it has no such number.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    shown = panels[:MOST_PANELS]
+    columns = min(len(shown), _COLUMNS)
+    rows = -(-len(shown) // columns)
+    figure = new_figure(max(3.0 * columns + 1.0, 6.0), 2.8 * rows + 0.6)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for axis in axes.flat[len(shown) :]:
+        axis.set_visible(False)
+    above_pct = [_above_least_pct(panel.figures) for panel in shown]
+    top_pct = max(float(np.nanmax(above, initial=0.0)) for above in above_pct)
+    limit_pct = min(max(top_pct, _LEAST_PCT), _MOST_PCT)
+    for axis, panel, above in zip(axes.flat, shown, above_pct, strict=False):
+        image = _draw_panel(axis, panel, above, limit_pct, default)
+    for axis in axes[:, 0]:
+        axis.set_ylabel(literal_text(field))
+    label = f"{literal_text(metric)} above its least (%)"
+    extend = "max" if top_pct > limit_pct else "neither"
+    figure.colorbar(image, ax=axes, label=label, extend=extend)
+    left_out = f" (first {len(shown)} of {len(panels)})" if len(panels) > len(shown) else ""
+    lines = "line: best fixed" + ("" if default is None else ", dashed: config")
+    add_title(figure, f"Best {field} by month (dots; {lines}){left_out}")
+    return figure
+
+
+def _above_least_pct(figures: F64) -> F64:
+    """By how much figures, (M, V), are above the least of their month, in %."""
+    least = figures.min(axis=1, keepdims=True)
+    return np.asarray(100.0 * (figures / np.where(least == 0.0, np.nan, least) - 1.0))
+
+
+def _draw_panel(
+    axes: Axes, panel: MonthlyFigures, above_pct: F64, limit_pct: float, default: float | None
+) -> QuadMesh:
+    """Draw one data center."""
+    figures, places = panel.figures, np.arange(len(panel.months))
+    image = axes.pcolormesh(
+        places,
+        panel.values,
+        above_pct.T,
+        cmap="cividis",
+        vmin=0.0,
+        vmax=limit_pct,
+        shading="nearest",
+    )
+    axes.axhline(panel.values[figures.sum(axis=0).argmin()], color=ORANGE, linewidth=1.6)
+    if default is not None:
+        axes.axhline(default, color="white", linewidth=1.2, linestyle="--")
+    axes.plot(places, panel.values[figures.argmin(axis=1)], "o", color="white", mec="black", ms=6)
+    axes.set_xticks(places, [str(month) for month in panel.months])
+    axes.set_title(literal_text(panel.name), fontsize=10)
+    axes.set_xlabel("month")
+    return image
+
+
+def interval_plot(
+    intervals: Mapping[str, tuple[float, float, float]],
+    label: str,
+    *,
+    marks: Sequence[float] = (),
+) -> Figure:
+    """Values with their intervals, one below the other.
+
+    Args:
+        intervals: name to a value and the ends of its interval, from the top to the bottom.
+        label: what the values are, with their unit.
+        marks: values at which vertical lines stand.
+
+    Raises:
+        SdcError: matplotlib is missing, or there are no intervals.
+    """
+    if not intervals:
+        raise SdcError("no intervals to draw; valid is one or more")
+    figure = new_figure(9.0, 1.2 + 0.28 * len(intervals))
+    axes = figure.subplots()
+    for at, (value, low, high) in enumerate(intervals.values()):
+        axes.plot([low, high], [at, at], color=BLUE, linewidth=5.0, alpha=0.35,
+                  solid_capstyle="butt")  # fmt: skip
+        axes.plot(value, at, "o", color=BLUE, markersize=5)
+    for mark in marks:
+        axes.axvline(mark, color=GREY, linewidth=1.0, linestyle=":")
+    axes.set_yticks(range(len(intervals)), [literal_text(name) for name in intervals], fontsize=9)
+    axes.set_ylim(len(intervals) - 0.5, -0.5)
+    axes.set_xlabel(label)
+    axes.spines[:].set_visible(False)
+    axes.grid(axis="x", alpha=0.25)
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def profile_plot(thresholds: F64, profiles: Mapping[str, F64], label: str) -> Figure:
+    """Share of runs above each of several thresholds, after Dolan and Moré (2002).
+
+    Args:
+        thresholds: of the score, (T,).
+        profiles: name to the share of runs whose score is above each threshold, 0..1, (T,).
+        label: what the score is, with its unit.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    figure = new_figure(9.0, 5.0)
+    axes = figure.subplots()
+    for index, (name, shares) in enumerate(profiles.items()):
+        axes.plot(thresholds, 100.0 * shares, linewidth=1.6, label=literal_text(name),
+                  **line_style(index))  # fmt: skip
+    axes.set_ylim(0.0, 100.0)
+    axes.set(xlabel=f"threshold: {label}", ylabel="weeks above the threshold (%)")
+    style_axes_with_legend(axes)
+    return figure

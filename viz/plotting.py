@@ -45,6 +45,8 @@ LINE_COLOURS = (BLUE, ORANGE, GREEN, RED, PINK, SKY, "black", "#B8A800")
 """Colours of lines in the order in which they are taken; the yellow is darkened for white paper."""
 LINE_STYLES = ("-", "--", ":", "-.")
 """Dashes of lines, changed when all colours are taken."""
+DAY = np.timedelta64(1, "D")
+"""Length of a day."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -164,6 +166,33 @@ def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
             f"steps: {len(times)} rows; valid are two or more with increasing time, "
             "of one data center"
         )
+
+
+def is_over_a_year(steps: pd.DataFrame) -> bool:
+    """Whether a run is longer than a year, so that its days occur more than once."""
+    return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * DAY)
+
+
+def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
+    """First row of a day, and the first row after it.
+
+    Args:
+        steps: steps of the data center.
+        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
+
+    Raises:
+        SdcError: the run does not have the day.
+    """
+    days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
+    names = [str(each) for each in days]
+    found = [i for i, name in enumerate(names) if date in (name, name[-5:])]
+    if not found:
+        raise SdcError(
+            f"date {date!r}: valid is MM-DD of a day of the run, "
+            f"{names[0][-5:]} to {names[-1][-5:]} ({len(days)} days)"
+        )
+    rows = [*map(int, first), len(steps)]
+    return rows[found[0]], rows[found[0] + 1]
 
 
 def step_edges(steps: pd.DataFrame) -> npt.NDArray[np.datetime64]:
@@ -319,3 +348,20 @@ def format_time_axis(axes: Axes) -> None:
         )
     )
     axes.set_xlabel("local standard time")
+
+
+def format_day_axis(axes: Axes, steps: pd.DataFrame, *, over_a_year: bool) -> None:
+    """Let a time axis span the day of some steps, and name the day.
+
+    Args:
+        axes: axes with the time to the right.
+        steps: steps of one day.
+        over_a_year: whether the run is longer than a year.
+    """
+    from matplotlib.dates import DateFormatter, HourLocator
+
+    axes.xaxis.set_major_locator(HourLocator(range(0, 24, 3)))  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
+    begin = steps["time"].iloc[0].normalize()
+    axes.set_xlim(begin, begin + DAY)
+    axes.set_xlabel(f"local standard time on {date_text(begin, over_a_year=over_a_year)}")

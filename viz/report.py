@@ -10,26 +10,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.errors import SdcError
-from sdc_taichi.run.folder_reader import RunFolder, is_number
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.run.folder_reader import RunFolder, is_number, read_configs
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
+from sdc_taichi.run.inlets_of_run import InletsAtStep, hottest_inlets
+from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, rack_text, state_texts
 
-from .report_html import html_page, time_span_text
+from .plotting import format_number
+from .report_html import (
+    DASH,
+    MAX_ROWS,
+    bullets,
+    count_text,
+    first_texts,
+    html_page,
+    html_table,
+    key_figures,
+    local_time,
+    metric_text,
+    names_text,
+    notice,
+    paragraph,
+    time_span_text,
+    time_text,
+)
 from .report_metrics import LABELS, MAX_DC_COLUMNS, comparison_section, metrics_section
-from .report_optimum import known_optimum, optimum_section, shares_of
 from .report_pictures import (
     data_center_section,
     fleet_section,
     inputs_section,
+    known_optimum,
+    optimum_section,
+    shares_of,
     shown_data_centers,
-)
-from .report_sections import (
-    events_section,
-    hot_racks_section,
-    provenance_section,
-    summary_section,
 )
 
 RATIOS = ("pue", "pue_with_losses", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh")
@@ -119,3 +136,279 @@ def _check_metrics(run: RunFolder) -> None:
     hottest = run.metrics["total"].get("hottest_dc")
     if hottest not in run.names:
         raise SdcError(f"{path}: total.hottest_dc {hottest!r}: no such data center")
+
+
+KEY_METRICS = (
+    ("facility energy", "facility_kwh", "kWh"),
+    ("PUE", "pue", ""),
+    ("cost, currency of the tariff", "cost", ""),
+    ("carbon footprint", "cfp_kg", "kg CO₂e"),
+    ("make-up water", "water_l", "L"),
+    ("hottest inlet", "hottest_inlet_c", "°C"),
+    ("dropped work", "dropped_tasks", "tasks"),
+)
+"""Metrics at the head of the summary: label, name in metrics.json, unit."""
+LOSSES = {
+    "throttled_rack_h": "Racks were throttled for {} rack h because of hot air.",
+    "tripped_rack_h": "Racks were switched off for {} rack h because of hot air.",
+    "unserved_kwh": "In grid outages, {} kWh could not be served.",
+    "grid_overload_kwh": "The grid connection carried {} kWh beyond its limit.",
+    "unmet_cooling_kwh": "The plant lacked capacity for {} kWh of heat.",
+}
+"""Sentences about metrics that are zero in a run without trouble, by their names."""
+NAMED_SOURCES = 3
+"""Number of racks that are named with the warming by their exhaust."""
+INLET_HEADS = (
+    "rack",
+    "inlet (°C)",
+    "supply setpoint (°C)",
+    "supply over setpoint (K)",
+    "exhaust of other racks (K)",
+    "own exhaust (K)",
+    "height in the rack (K)",
+    "CRAC air that falls short (K)",
+    "most from (K)",
+)
+"""Columns of the table of a hall with recirculation; the inlet is the sum of the four numbers that
+follow it."""
+APPROACH_HEADS = (*INLET_HEADS[:4], "approach temperature (K)")
+"""Columns of the table of a hall without recirculation; the inlet is the sum of the others."""
+
+
+def summary_section(run: RunFolder) -> str:
+    """Notices, key figures, the hottest inlet, where the work went, and what ran."""
+    metrics, names = run.metrics, run.names
+    total, done, asked = metrics["total"], metrics["steps_done"], metrics["steps_asked"]
+    notices = [f"Note: {note}" for note in first_texts(metrics["notes"])]
+    if metrics["synthetic"]:
+        notices.insert(
+            0,
+            "Inputs are SYNTHETIC, at least in part: these figures do not rest on measurements "
+            "alone (see Provenance).",
+        )
+    if done < asked:
+        notices.insert(
+            0,
+            f"The run was interrupted: {done:,} of {asked:,} steps were done, and all figures "
+            "are of these.",
+        )
+    sites = list(dict.fromkeys(dc["location"] for dc in metrics["data_centers"]))
+    length = count_text(run.hours / 24, "day")
+    facts = {
+        "data centers": f"{len(names):,}: {names_text(names)}",
+        "sites": names_text(sites),
+        "controller": metrics["controller"],
+        "steps": f"{done:,} of {60 * metrics['step_h']:g} min, {length}",
+        "seed": f"{metrics['seed']}",
+        "precision of the kernels": metrics["precision"],
+        "folder": run.path.resolve().name,
+        "versions": ", ".join(f"{name} {value}" for name, value in metrics["versions"].items()),
+        "fingerprint of configs, inputs and precision": metrics["fingerprint"],
+    }
+    return (
+        "".join(map(notice, notices))
+        + key_figures((k, f"{metric_text(total, key)} {unit}") for k, key, unit in KEY_METRICS)
+        + bullets([_hottest_inlet_text(run), *_work_texts(run)])
+        + html_table("What ran", None, list(facts.items()))
+    )
+
+
+def _hottest_inlet_text(run: RunFolder) -> str:
+    """Place and time of the hottest inlet, and how long the hall was too hot, in words."""
+    total = run.metrics["total"]
+    where = total["hottest_dc"]
+    dc = run.names.index(where)
+    moment = time_text(run, local_time(run, dc, total["hottest_step"]))
+    hours = run.metrics["data_centers"][dc]["metrics"]["inlet_above_27_h"]
+    (config,) = read_configs(run, [dc])
+    row, rack = divmod(total["hottest_rack"], config.hall.racks_per_row)
+    return (
+        f"The hottest inlet was {metric_text(total, 'hottest_inlet_c')} °C in {where}, row {row}, "
+        f"rack {rack}, server {total['hottest_server']} from the floor, on {moment}. An inlet "
+        f"there was above {RECOMMENDED_C[1]:g} °C for {format_number(hours)} h, "
+        f"{100 * hours / run.hours:.3g} % of the time."
+    )
+
+
+def _work_texts(run: RunFolder) -> list[str]:
+    """Where work, stored energy and capacity went, in words."""
+    total = run.metrics["total"]
+    text = {key: metric_text(total, key) for key in total if key != "hottest_dc"}
+    arrived = total["arrived_tasks"]
+    dropped_pct = 100 * total["dropped_tasks"] / arrived if arrived else 0.0
+    (config,) = read_configs(run, [0])
+    dropped = (
+        f"{text['dropped_tasks']} of them at once because the queue was full ({dropped_pct:.3g} %),"
+        if config.workload.model == "tasks"
+        else f"{text['dropped_tasks']} dropped ({dropped_pct:.3g} %)"
+    )
+    texts = [
+        f"Of {text['arrived_tasks']} tasks that arrived, {text['executed_tasks']} were done, "
+        f"{dropped} and {text['lost_tasks']} lost with their servers; {text['queue_end_tasks']} "
+        "were queued at the end.",
+        f"The battery took {text['battery_charge_kwh']} kWh from the grid and gave "
+        f"{text['battery_discharge_kwh']} kWh back."
+        if total["battery_charge_kwh"] > 0
+        else "The battery was not charged.",
+    ]
+    texts += [sentence.format(text[key]) for key, sentence in LOSSES.items() if total[key] > 0]
+    if total["time_to_throttle_min"] is not None:
+        minutes = text["time_to_throttle_min"]
+        texts.append(f"The first rack throttled {minutes} min after an event began.")
+    return texts
+
+
+class _Event(NamedTuple):
+    """A failure, outage or heat wave of a data center."""
+
+    dc: int
+    """Index of the data center."""
+    kind: str
+    """Kind in words."""
+    begin: int
+    """First step."""
+    end: int
+    """Step after the last."""
+    target: str
+    """Unit or rack of the hall, empty for the whole."""
+    amount: str
+    """Share left of a device, or difference of temperature."""
+
+
+def events_section(run: RunFolder) -> str:
+    """Failures, outages and heat waves of the run, one by one, or by kind if there are many."""
+    events = [
+        _Event(
+            index,
+            str(event["kind"]).replace("_", " "),
+            event["start_step"],
+            event["end_step"],
+            str(event.get("target", "")),
+            (f"{100 * event['share']:.0f} % left" if "share" in event else "")
+            + (f"{event['offset_k']:+g} K" if "offset_k" in event else ""),
+        )
+        for index, dc in enumerate(run.metrics["data_centers"])
+        for event in dc["events"]
+    ]
+    if not events:
+        return paragraph("None: the run met no failure, outage or heat wave.")
+    step_h = run.metrics["step_h"]
+    caption = f"{count_text(len(events), 'event')} that the run met"
+    if len(events) > MAX_ROWS:
+        return _events_by_kind(run, events, f"{caption}, by kind; all are in {METRICS_FILE}")
+    rows = [
+        (
+            run.names[event.dc],
+            event.kind,
+            event.target,
+            event.amount,
+            time_text(run, local_time(run, event.dc, event.begin)),
+            format_number((event.end - event.begin) * step_h),
+            f"{event.begin} to {event.end - 1}",
+        )
+        for event in events
+    ]
+    heads = ("data center", "event", "unit or rack in hall", "amount",
+             "from (local standard time)", "duration (h)", "steps")  # fmt: skip
+    return html_table(caption, heads, rows, numbers=(5, 6))
+
+
+def _events_by_kind(run: RunFolder, events: Sequence[_Event], caption: str) -> str:
+    """Table of events with a row for each kind."""
+    rows = []
+    for kind in sorted({event.kind for event in events}):
+        alike = [event for event in events if event.kind == kind]
+        first = min(alike, key=lambda event: event.begin)
+        hours = sum(event.end - event.begin for event in alike) * run.metrics["step_h"]
+        figures = (len(alike), len({event.dc for event in alike}), hours)
+        begin = time_text(run, local_time(run, first.dc, first.begin))
+        rows.append((kind, *map(format_number, figures), f"{begin} in {run.names[first.dc]}"))
+    heads = ("event", "events", "data centers", "duration together (h)",
+             "first (local standard time)")  # fmt: skip
+    return html_table(caption, heads, rows, numbers=(1, 2, 3))
+
+
+def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
+    """Why the hottest racks of some data centers are as hot as they are.
+
+    Args:
+        run: the run.
+        dcs: indices of the data centers.
+
+    Raises:
+        SdcError: steps.parquet is damaged.
+    """
+    parts = [
+        paragraph(
+            "Each inlet is the sum of setpoint, supply air over its setpoint, and exhausts or the "
+            "approach temperature of the config. Height and missing CRAC air are why a part of the "
+            "exhausts reaches it."
+        )
+    ]
+    for dc in dcs:
+        try:
+            inlets = hottest_inlets(run, dc)
+        except ConfigError as error:
+            parts.append(paragraph(f"{run.names[dc]}: {error}"))
+            continue
+        if inlets is None:
+            text = (
+                "the run has too many racks for the air of a step to be kept; sdc-taichi hall why"
+            )
+            parts.append(paragraph(f"{run.names[dc]}: {text} simulates it again."))
+        else:
+            parts.append(_hot_racks(run, dc, inlets))
+    return "".join(parts)
+
+
+def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
+    """Table of the hottest racks of a data center, and the state of the hottest in words."""
+    hall = hottest.config.hall
+    recirculates = hall.inlet_model == "recirculation"
+    racks = [hottest.inlets.parts(rack) for rack in hottest.inlets.hottest(HOTTEST_RACKS)]
+    heads = INLET_HEADS if recirculates else APPROACH_HEADS
+    caption = (
+        f"Hottest racks of {run.names[dc]} at the end of the step of its hottest inlet, "
+        f"{hottest.hottest_c:.2f} °C on {time_text(run, local_time(run, dc, hottest.step))}"
+    )
+    texts = [f"{text[0].upper()}{text[1:]}." for text in state_texts(racks[0])]
+    if recirculates:
+        share = f"{100 * racks[0].exhaust_share:.1f} %"
+        texts.insert(0, f"Of the intake of the hottest, {share} is exhaust air.")
+    rows = [_rack_cells(parts, hall.racks_per_row, recirculates=recirculates) for parts in racks]
+    numbers = range(1, len(heads) - recirculates)
+    return html_table(caption, heads, rows, numbers=numbers) + bullets(texts)
+
+
+def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) -> list[str]:
+    """Cells of one rack."""
+    temperatures = [parts.inlet_c, parts.setpoint_c, parts.warming_k]
+    if recirculates:
+        others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k + parts.lag_k
+        temperatures += [others_k, parts.own_exhaust_k, parts.height_k, parts.shortfall_k]
+    else:
+        temperatures.append(parts.approach_k)
+    cells = [rack_text(parts.rack, racks_per_row), *(f"{value:z.2f}" for value in temperatures)]
+    if recirculates:
+        sources = ", ".join(f"rack {rack} {k:.2f}" for rack, k in parts.sources(NAMED_SOURCES))
+        cells.append(sources or DASH)
+    return cells
+
+
+def provenance_section(run: RunFolder) -> str:
+    """Source of every input, with the SHA-256 of files and the data centers that use it."""
+    users: dict[tuple[str, str, str], list[str]] = {}
+    for dc in run.metrics["data_centers"]:
+        sources, hashes = dc["provenance"], dc["sha256"]
+        for kind in {**sources, **hashes}:
+            source = str(sources.get(kind, "file that the config names"))
+            users.setdefault((kind, source, str(hashes.get(kind, ""))), []).append(dc["name"])
+    rows = [
+        (kind, source, digest or DASH, names_text(names))
+        for (kind, source, digest), names in sorted(users.items())
+    ]
+    caption = f"Where the inputs come from; {count_text(len(rows), 'source')}"
+    if len(rows) > MAX_ROWS:
+        caption += f", the first {MAX_ROWS}, all are in {METRICS_FILE}"
+    heads = ("input", "source", "SHA-256 of the file", "data centers")
+    return html_table(caption, heads, rows[:MAX_ROWS])

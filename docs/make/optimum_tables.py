@@ -32,7 +32,7 @@ from sdc_taichi.learning.split import HELD_OUT, first_day
 from sdc_taichi.optimum import solve
 from sdc_taichi.run.achievable import AchievedPath, run_beside
 from sdc_taichi.types import F64
-from sdc_taichi.viz.optimum_figure import COLUMNS, day_of_most_saved, optimum_day
+from sdc_taichi.viz.figures import OPTIMUM_COLUMNS, day_of_most_saved, optimum_day
 from sdc_taichi.viz.plotting import save_picture
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
@@ -147,7 +147,7 @@ def steps_under(sim: Simulator, controller: Controller, steps: int) -> pd.DataFr
     simulate(sim, controller, steps, on_step=results.append)
     columns = {
         name: [float(getattr(result, name)[0]) for result in results]
-        for name in (*COLUMNS[1:], "carbon_g")
+        for name in (*OPTIMUM_COLUMNS[1:], "carbon_g")
     }
     times = step_times(sim.drivers.start, np.arange(steps), sim.fleet.steps_per_hour)
     return pd.DataFrame({"time": times[:, 0], **columns})

@@ -25,7 +25,7 @@ from sdc_taichi import (
     simulate_to_folder,
 )
 from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
-from sdc_taichi.viz import dashboards, fleet_figures, step_panels
+from sdc_taichi.viz import dashboards, figures, fleet_figures
 from sdc_taichi.viz.figures import clock_text, draw_hall, hall_map, overview, step_time
 from sdc_taichi.viz.plotting import DPI, format_time_axis, new_figure, webp
 
@@ -78,7 +78,7 @@ def readme_picture(sim: Simulator, result: StepResult, steps: pd.DataFrame) -> F
     left.suptitle(f"Racks on {clock_text(result, sim.fleet, 0)}", fontsize=13)
     right.suptitle("Power, carbon, queue and battery", fontsize=13)
     panels = right.subplots(3, 1, sharex=True, height_ratios=[4, 3, 3])
-    draws = (step_panels.draw_power, step_panels.draw_carbon, step_panels.draw_storage)
+    draws = (figures.draw_power, figures.draw_carbon, figures.draw_storage)
     for axes, draw in zip(panels, draws, strict=True):
         draw(axes, steps)
         axes.axvline(step_time(result, sim.fleet, 0), color="black", linewidth=1, linestyle=":")

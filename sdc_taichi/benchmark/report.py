@@ -43,8 +43,7 @@ from sdc_taichi.benchmark.suite_results import (
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.evaluation import ALL, IDLE
 from sdc_taichi.learning.statistics import performance_profile
-from sdc_taichi.viz.benchmark_figures import interval_plot, profile_plot
-from sdc_taichi.viz.fleet_figures import MAX_RUNS
+from sdc_taichi.viz.fleet_figures import MAX_RUNS, interval_plot, profile_plot
 from sdc_taichi.viz.plotting import new_figure
 
 if TYPE_CHECKING:

@@ -156,8 +156,8 @@ def _write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
         raise DataError(
             'a picture needs matplotlib: pip install "sdc-taichi[plot]" (or leave out --out)'
         ) from None
+    from sdc_taichi.viz.data_figures import draw_year
     from sdc_taichi.viz.plotting import save_picture
-    from sdc_taichi.viz.year_figure import draw_year
 
     known = FigureCanvasAgg.get_supported_filetypes()
     suffix = out.suffix.lstrip(".").lower()

@@ -216,7 +216,7 @@ def failover_command(
     check_out_file(table_path, ".csv", force=force)
     study = study_failover(config.read()[0], of.value)
     if out is not None and table_path is not None:
-        from sdc_taichi.viz.failover_figure import failover_figure
+        from sdc_taichi.viz.floor_plan_figure import failover_figure
         from sdc_taichi.viz.plotting import save_picture
 
         save_picture(failover_figure(study), out, parents=True)

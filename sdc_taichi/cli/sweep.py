@@ -249,7 +249,7 @@ def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -
     )
     from sdc_taichi.benchmark.vary import value_at
     from sdc_taichi.learning.evaluation_table import markdown
-    from sdc_taichi.viz.best_value import MonthlyFigures, plot_best_values
+    from sdc_taichi.viz.fleet_figures import MonthlyFigures, plot_best_values
     from sdc_taichi.viz.plotting import save_picture
 
     field = chosen_grid(sweep).field
