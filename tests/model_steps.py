@@ -1,8 +1,12 @@
-"""Steps of device models by name, for tests: all values of a point as keywords."""
+"""Steps of device models by name, for tests, and what every result of a model must hold."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import Any
+
+import numpy as np
+import pytest
 
 from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint, BatteryResult
 from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters, ChillerPoint, ChillerResult
@@ -26,3 +30,20 @@ def battery_step(name: str, stored_kwh: Any, command: Any, **values: Any) -> Bat
 def work_done(name: str, demand: Any, command: Any, waiting: Any, due: Any, **limits: Any) -> Work:
     """What a model of work does in one step."""
     return MODELS[name].step(WorkPoint(demand, command, waiting, due, **limits))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def floating_point_errors() -> Iterator[None]:
+    """Raise where a model divides by zero, overflows or makes NaN."""
+    with np.errstate(all="raise", under="ignore"):
+        yield
+
+
+def assert_batch(result: Any, alone: Callable[[slice], Any]) -> None:
+    """Assert that results are finite f64 of five data centers, each the same alone."""
+    for field in result._fields if hasattr(result, "_fields") else result.__slots__:
+        values = getattr(result, field)
+        assert (values.shape, values.dtype) == ((5,), np.float64)
+        assert np.isfinite(values).all()
+        for i in range(5):
+            assert getattr(alone(slice(i, i + 1)), field)[0] == values[i]

@@ -12,7 +12,7 @@ from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
-from sdc_taichi.plant.electrical import loss_w
+from sdc_taichi.plant.electrical import LossyDevice
 from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
 from sdc_taichi.viz.recording_series import FIELD_ROWS, FIELDS
@@ -64,13 +64,6 @@ def test_a_load_above_the_limit_empties_the_battery_and_then_overloads_the_conne
     assert column(found, "soc")[-1] < 0.01
     assert over_kwh[-1] > 20
     np.testing.assert_allclose(over_kwh, np.maximum(grid_kwh - 37.5, 0), atol=1e-6)
-
-
-def test_presets_of_the_paper_have_no_limit() -> None:
-    for preset in ("paper", "sustaindc"):
-        config = load_config(preset)
-        assert config.electrical.grid_limit_kw is config.electrical.grid_limit_ratio is None
-    assert load_config("corrected").electrical.grid_limit_ratio == 1.25
 
 
 def test_a_battery_of_an_hour_carries_an_outage_at_one_c() -> None:
@@ -189,7 +182,7 @@ def test_efficiencies_are_the_published_ones(
 ) -> None:
     config = getattr(load_config("corrected").electrical, device)
     load_w = 2e5 * np.array(load_shares)
-    lost_w = loss_w(load_w, 2e5, **config.model_dump())
+    lost_w = LossyDevice(2e5, **config.model_dump()).loss_w(load_w)
     np.testing.assert_allclose(load_w / (load_w + lost_w), efficiencies, atol=6e-4)
 
 
@@ -211,42 +204,12 @@ def test_reported_losses_change_nothing_else_and_counted_ones_are_paid_for() -> 
     assert design_kw(["electrical.losses=counted"]) > 1.03 * design_kw([])
 
 
-def test_a_constant_efficiency_is_a_proportional_loss() -> None:
-    """As the presets of the paper have it: 96 % at any load."""
-    with Simulator(load_config("paper")) as sim:
-        result = (sim.reset(), sim.step())[1]
-    assert result.ups_loss_w == pytest.approx(result.it_w / 0.96 - result.it_w, rel=1e-12)
-    assert result.distribution_loss_w == 0
-
-
 def test_nothing_is_lost_without_power() -> None:
     outage = "events.scheduled=[{kind: grid_outage, start_h: 0.25, duration_h: 0.5}]"
     found = charged([outage, "electrical.losses=counted", "battery.capacity_kwh=0"], 0.0, 4)
     for name in ("ups_loss_w", "distribution_loss_w", "overhead_w", "grid_kwh"):
         lost = column(found, name)
         assert lost[0] > 0 == lost[1] == lost[2] < lost[3], name
-
-
-def test_a_data_center_with_a_limit_is_the_same_alone_and_beside_others() -> None:
-    limits = ["electrical.grid_limit_kw=0.5", "electrical.grid_limit_ratio=null"]
-    configs = [load_config("tiny", [f"name=dc-{i}", limits[i % 2], f"battery.initial_soc={i / 3}"])
-               for i in range(3)]  # fmt: skip
-    command = np.array([1.0, -1.0, 0.4])
-
-    def run(which: list[int]) -> dict[str, F64]:
-        found: dict[str, list[F64]] = {}
-        with Simulator([configs[i] for i in which], precision="f64") as sim:
-            sim.reset()
-            for step in range(12):
-                result = sim.step(Actions(battery=(-1) ** (step // 3) * command[which]))
-                for name, values in result.per_dc().items():
-                    found.setdefault(name, []).append(values.copy())
-        return {name: np.array(values) for name, values in found.items()}
-
-    together = run([0, 1, 2])
-    for i in range(3):
-        for name, values in run([i]).items():
-            np.testing.assert_array_equal(values[:, 0], together[name][:, i], name)
 
 
 def test_the_log_of_a_recording_tells_of_an_overload() -> None:

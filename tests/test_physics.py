@@ -55,17 +55,6 @@ def test_coldest_setpoint_is_best_in_the_released_code(study: ModuleType, site: 
     assert coldest.all() if site == "CA" else coldest.mean() > 0.7
 
 
-@pytest.mark.repo
-def test_the_study_of_setpoints_draws_its_picture(
-    study: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("matplotlib")
-    for name in ("WET_BULBS_C", "UTILISATIONS"):
-        monkeypatch.setattr(study, name, getattr(study, name)[::8])
-    study.main(tmp_path)
-    assert (tmp_path / "best_setpoint.png").stat().st_size > 10_000
-
-
 def test_annual_pue_of_all_sites_is_that_of_real_plants() -> None:
     base = load_config("corrected", ["simulation.steps_per_hour=1"])
     sites = [name for name in site_names() if len(name) == 2]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_checks import assert_batch, checks_of, floating_point_errors  # noqa: F401
+from model_steps import assert_batch, floating_point_errors  # noqa: F401
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
@@ -36,42 +36,6 @@ def run(name: str, **changes: Any) -> WaterUse:
         "dt_s": 900.0,
     }
     return WATER[name](WaterPoint(**{**arguments, **changes}))
-
-
-def evaluated(check: dict[str, Any]) -> dict[str, float]:
-    inputs = check["inputs"]
-    if check["id"] == "W-PHYS-1MW":
-        rejected_w = inputs["Q_cool_W"] * (1.0 + 1.0 / inputs["COP"])
-        result = run(
-            "mass_balance",
-            rejected_w=rejected_w,
-            range_k=inputs["range_K"],
-            water_kg_s=rejected_w / (4184.0 * inputs["range_K"]),
-            cycles_of_concentration=inputs["COC"],
-            drift_share=inputs["drift_frac_circ"],
-            dt_s=inputs["dt_s"],
-        )
-        return {
-            "evap_L": float(result.evaporation_l),
-            "blowdown_L": float(result.blowdown_l),
-            "drift_L": float(result.drift_l),
-            "makeup_L": float(result.water_l),
-            "L_per_kWh_heat": float(result.water_l) / (rejected_w * inputs["dt_s"] / 3.6e6),
-        }
-    place = {
-        "wet_bulb_c": inputs["Twb"],
-        "return_c": inputs["T_ret"],
-        "supply_setpoint_c": inputs["setpoint"],
-    }
-    return {
-        "code_L_15min": float(run("released", **place).water_l),
-        "paper_eq_L_15min": float(run("paper", **place).water_l),
-    }
-
-
-@checks_of("water")
-def test_check(check: dict[str, Any]) -> None:
-    assert evaluated(check) == pytest.approx(check["expected"], **check["tolerance"])
 
 
 @given(
@@ -155,13 +119,6 @@ def test_evaporation_follows_the_climate() -> None:
     assert litres[4] > 3.6e6 / 2.45e6  # Warm dry air gives heat of its own.
 
 
-def test_evaporation_of_half_the_step_is_half() -> None:
-    """As in a step of which the plant ran a half: heat and air are means of the step."""
-    whole = run("saturated_exit")
-    half = run("saturated_exit", rejected_w=5e5, tower_airflow_m3s=26.67 / 2.0)
-    assert half.evaporation_l == pytest.approx(whole.evaporation_l / 2.0, rel=1e-12)
-
-
 @pytest.mark.parametrize("pressure_pa", [70_000.0, 85_000.0, 101_325.0])
 def test_polynomials_of_moist_air(pressure_pa: float) -> None:
     """Against the equations of whole years, from frost to the tropics."""
@@ -189,21 +146,6 @@ def test_litres_scale_with_the_step(name: str) -> None:
     quarter, hour = run(name), run(name, dt_s=3600.0)
     for field in FIELDS:
         np.testing.assert_allclose(getattr(hour, field), 4.0 * getattr(quarter, field), rtol=1e-6)
-
-
-def test_fits_split_off_one_percent_of_drift() -> None:
-    for name, slope, offset in (("released", 0.3528, 0.101), ("paper", 0.35, 0.1)):
-        result = run(name)
-        use_l = (0.044 * 15.0 + slope * 12.0 + offset) * 250.0
-        assert float(result.evaporation_l) == pytest.approx(use_l, abs=1e-4)
-        assert float(result.drift_l) == pytest.approx(0.01 * use_l)
-        assert float(result.blowdown_l) == 0.0
-
-
-def test_released_litres_have_four_decimals() -> None:
-    makeup = run("released", wet_bulb_c=np.linspace(-40.0, 25.0, 50)).water_l
-    np.testing.assert_array_equal(makeup, np.round(makeup, 4))
-    assert makeup[0] == round((0.044 * -40.0 + 0.3528 * 12.0 + 0.101) * 1.01 * 250.0, 4)
 
 
 def test_fits_never_turn_into_a_source() -> None:

@@ -528,7 +528,7 @@ def check_yorkcalc(check: Check) -> Values:
 def check_tower_fan(check: Check) -> Values:
     given = check["inputs"]
     flow = tower.design_water_kg_s(given["Q_rej_W"], range_k=given["range_K"])
-    fan_w = tower.sized_fan_w(flow, fan_w_per_kg_s=given["fan_W_per_kgps"])
+    fan_w = given["fan_W_per_kgps"] * flow
     return {
         "m_water": flow,
         "P_fan_design_W": fan_w,

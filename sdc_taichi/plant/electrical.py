@@ -10,7 +10,7 @@ a is lost without any load, b in semiconductors, c in conductors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,79 +22,50 @@ ROUND_OFF_SHARE = 1e-9
 """Share of the limit by which rounding may exceed it."""
 
 
-@dataclass(frozen=True, slots=True)
-class PowerPath:
-    """UPS and distribution of B data centers, from the grid's bus to the racks."""
+class LossyDevice(NamedTuple):
+    """A device of the power path of B data centers: the UPS, or the distribution behind it."""
 
-    ups_rated_w: F64
-    """Rated power of the UPS, in W, (B,)."""
-    ups_no_load_share: F64
-    """Loss of the UPS without load over rated power, (B,)."""
-    ups_proportional_share: F64
-    """Loss of the UPS in proportion to its load, over the load, (B,)."""
-    ups_square_share: F64
-    """Loss of the UPS by the square of its load, over rated power at full load, (B,)."""
-    distribution_rated_w: F64
-    """Rated power of transformers, PDUs and wiring behind the UPS, in W, (B,)."""
-    distribution_no_load_share: F64
-    """Loss of the distribution without load over rated power, (B,)."""
-    distribution_proportional_share: F64
-    """Loss of the distribution in proportion to its load, over the load, (B,)."""
-    distribution_square_share: F64
-    """Loss of the distribution by the square of its load, over rated power at full load, (B,)."""
+    rated_w: Values
+    """Power that the device is made for, in W, above 0, (B,)."""
+    no_load_share: Values
+    """Loss without load, divided by the rated power, (B,)."""
+    proportional_share: Values
+    """Loss in proportion to the load, divided by the load, (B,)."""
+    square_share: Values
+    """Loss by the square of the load, divided by the rated power, at full load, (B,)."""
 
+    def loss_w(self, load_w: Values) -> Values:
+        """Loss while the device delivers a load, in W, (B,).
 
-def loss_w(
-    load_w: Values,
-    rated_w: Values,
-    *,
-    no_load_share: Values,
-    proportional_share: Values,
-    square_share: Values,
-) -> Values:
-    """Loss of a device of the power path.
-
-    Args:
-        load_w: Power that it delivers, W, (B,).
-        rated_w: Power that it is made for, W, (B,), above 0.
-        no_load_share: Loss without load over rated power.
-        proportional_share: Loss in proportion to the load, over the load.
-        square_share: Loss by the square of the load, over rated power at full load.
-
-    Returns:
-        Loss, W, (B,).
-    """
-    load_share = load_w / rated_w
-    return no_load_share * rated_w + (proportional_share + square_share * load_share) * load_w
+        Args:
+            load_w: Power that it delivers, W, (B,).
+        """
+        load_share = load_w / self.rated_w
+        load_loss_share = self.proportional_share + self.square_share * load_share
+        return self.no_load_share * self.rated_w + load_loss_share * load_w
 
 
-def power_path_loss_w(it_w: Values, path: PowerPath) -> tuple[Values, Values]:
-    """Losses on the way to the racks; the UPS carries those of the distribution behind it.
+class PowerPath(NamedTuple):
+    """Power path of B data centers, from the grid's bus to the racks."""
 
-    Cooling is supplied beside the UPS.
+    ups: LossyDevice
+    """Uninterruptible power supply."""
+    distribution: LossyDevice
+    """Transformers, PDUs and wiring between the UPS and the racks."""
 
-    Args:
-        it_w: IT power, W, (B,).
-        path: UPS and distribution.
+    def losses_w(self, it_w: Values) -> tuple[Values, Values]:
+        """Losses of UPS and distribution; the UPS delivers those of the distribution as well.
 
-    Returns:
-        Losses of the UPS and of the distribution, W, (B,) each.
-    """
-    distribution_w = loss_w(
-        it_w,
-        path.distribution_rated_w,
-        no_load_share=path.distribution_no_load_share,
-        proportional_share=path.distribution_proportional_share,
-        square_share=path.distribution_square_share,
-    )
-    ups_w = loss_w(
-        it_w + distribution_w,
-        path.ups_rated_w,
-        no_load_share=path.ups_no_load_share,
-        proportional_share=path.ups_proportional_share,
-        square_share=path.ups_square_share,
-    )
-    return ups_w, distribution_w
+        Cooling gets its power beside the UPS.
+
+        Args:
+            it_w: IT power, W, (B,).
+
+        Returns:
+            Loss of the UPS and loss of the distribution, W, (B,) each.
+        """
+        distribution_w = self.distribution.loss_w(it_w)
+        return self.ups.loss_w(it_w + distribution_w), distribution_w
 
 
 def overload_kwh(grid_kwh: Values, limit_kwh: Values) -> F64:

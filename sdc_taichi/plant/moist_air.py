@@ -54,7 +54,16 @@ def saturated_ratio(temperature_c: Values, pressure_pa: Values) -> Values:
         temperature_c: Temperature, C; evaluated within -40..35 C.
         pressure_pa: Air pressure, Pa.
     """
-    vapour_pa = saturation_pa(temperature_c)
+    return vapour_ratio(saturation_pa(temperature_c), pressure_pa)
+
+
+def vapour_ratio(vapour_pa: Values, pressure_pa: Values) -> Values:
+    """Humidity ratio of air from the pressure of its vapour, kg of water per kg of dry air.
+
+    Args:
+        vapour_pa: Pressure of the vapour, Pa.
+        pressure_pa: Air pressure, Pa.
+    """
     return WATER_TO_DRY_AIR * vapour_pa / (pressure_pa - vapour_pa)
 
 

@@ -85,16 +85,8 @@ def water_cooled(
     chilled_c = chilled_water_c(point.setpoint_c, design)
 
     def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
-        return devices.chiller.step(
-            taken_w * (1.0 - economiser),
-            ChillerPoint(
-                reference_w=design.chiller_w,
-                chilled_water_c=chilled_c,
-                condenser_c=condenser_c,
-                outdoor_c=point.outdoor_c,
-                machine=design.machine,
-            ),
-        )
+        load_w = taken_w * (1.0 - economiser)
+        return _run_chiller(load_w, chilled_c, condenser_c, point, design, devices)
 
     # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
     taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
@@ -128,7 +120,7 @@ def water_cooled(
     machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
     economiser_w = taken_w * share
     return WaterSideResult(
-        heat_removed_w=np.maximum(load_w - machine.unmet_w, 0.0) if devices.limited else load_w,
+        heat_removed_w=_removed_w(load_w, machine, devices),
         economiser_w=economiser_w,
         chiller_load_w=machine.evaporator_w if devices.limited else taken_w - economiser_w,
         chiller_w=machine.power_w,
@@ -197,11 +189,12 @@ def air_cooled(
     share = np.minimum(over_k / np.maximum(full_range_k, range_k), 1.0)
     free_w = np.minimum(taken_w * share, full_speed_w)
     speed_share = free_w / np.maximum(full_speed_w, 1.0)
-    machine = _air_cooled_chiller(taken_w - free_w, chilled_c, point.outdoor_c, design, devices)
+    left_w = taken_w - free_w
+    machine = _run_chiller(left_w, chilled_c, point.outdoor_c, point, design, devices)
     return _dry(
-        np.maximum(load_w - machine.unmet_w, 0.0) if devices.limited else load_w,
+        _removed_w(load_w, machine, devices),
         free_w=free_w,
-        chiller_load_w=machine.evaporator_w if devices.limited else taken_w - free_w,
+        chiller_load_w=machine.evaporator_w if devices.limited else left_w,
         machine=machine,
         chilled_c=chilled_c,
         outdoor_c=point.outdoor_c,
@@ -230,7 +223,9 @@ def air_side(
     load_w = np.minimum(requested_w, design.cooling_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.setpoint_c, design)
     vapour_pa = _vapour_pa(point.outdoor_c, point.wet_bulb_c, design.pressure_pa)
-    ratio, least = (_ratio(pa, design.pressure_pa) for pa in (vapour_pa, design.least_vapour_pa))
+    ratio, least = (
+        moist_air.vapour_ratio(pa, design.pressure_pa) for pa in (vapour_pa, design.least_vapour_pa)
+    )
     lack = design.humidifier * np.maximum(least - ratio, 0.0)
     over_k = np.maximum(point.return_c - point.outdoor_c, 0.0)
     over_w_s_m3 = design.air_j_per_m3_k * (over_k + lack * _WETTING_K)
@@ -250,9 +245,9 @@ def air_side(
     if devices.limited:
         coil_w = np.minimum(coil_w, design.pumped_w)
     taken_w, chilled_pump_w, _ = chilled_water_load_w(coil_w, design)
-    machine = _air_cooled_chiller(taken_w, chilled_c, point.outdoor_c, design, devices)
+    machine = _run_chiller(taken_w, chilled_c, point.outdoor_c, point, design, devices)
     return _dry(
-        free_w + (np.maximum(coil_w - machine.unmet_w, 0.0) if devices.limited else coil_w),
+        free_w + _removed_w(coil_w, machine, devices),
         free_w=free_w,
         chiller_load_w=machine.evaporator_w if devices.limited else taken_w,
         machine=machine,
@@ -283,20 +278,30 @@ def fits(chiller: ChillerModel, plant: PlantModel) -> bool:
     return chiller.outdoor_air if plant.dry else chiller.tower_water
 
 
-def _air_cooled_chiller(
-    load_w: F64, chilled_c: F64, outdoor_c: F64, design: WaterSideDesign, devices: Devices
+def _run_chiller(
+    load_w: F64,
+    chilled_c: F64,
+    condenser_c: F64,
+    point: PlantPoint,
+    design: WaterSideDesign,
+    devices: Devices,
 ) -> ChillerResult:
-    """The chiller, whose condenser sees the outdoor air."""
+    """One step of the chiller of a plant, for its load in W and its waters in C, (B,) each."""
     return devices.chiller.step(
         load_w,
         ChillerPoint(
             reference_w=design.chiller_w,
             chilled_water_c=chilled_c,
-            condenser_c=outdoor_c,
-            outdoor_c=outdoor_c,
+            condenser_c=condenser_c,
+            outdoor_c=point.outdoor_c,
             machine=design.machine,
         ),
     )
+
+
+def _removed_w(load_w: F64, machine: ChillerResult, devices: Devices) -> F64:
+    """Part of the load of the coils that the plant removes, in W, (B,)."""
+    return np.maximum(load_w - machine.unmet_w, 0.0) if devices.limited else load_w
 
 
 def _dry(
@@ -330,11 +335,6 @@ def _dry(
         chilled_pump_w=chilled_pump_w,
         condenser_pump_w=condenser_pump_w,
     )
-
-
-def _ratio(vapour_pa: F64, pressure_pa: F64) -> F64:
-    """Humidity ratio of air by the pressure of its vapour, kg/kg, (B,)."""
-    return moist_air.WATER_TO_DRY_AIR * vapour_pa / (pressure_pa - vapour_pa)
 
 
 def _vapour_pa(outdoor_c: F64, wet_bulb_c: F64, pressure_pa: F64) -> F64:

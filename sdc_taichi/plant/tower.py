@@ -61,10 +61,6 @@ MIN_AIR_RATIO = 0.2
 _LEAST_K = 1e-9
 """Least difference of approaches that divides, in K."""
 
-FAN_W_PER_KG_S = 275.0 / 0.15
-"""Fan power at full speed per design water flow, in W/(kg/s): 275 W per 0.15 kg/s, the default of
-the Modelica model."""
-
 
 class TowerPoint(NamedTuple):
     """Weather, setpoints and sizes with which towers work."""
@@ -238,16 +234,6 @@ def design_water_kg_s(heat_w: Values, *, range_k: Values) -> Values:
         range_k: Entering minus leaving water, K, (B,).
     """
     return heat_w / (WATER_J_PER_KG_K * range_k)
-
-
-def sized_fan_w(water_kg_s: Values, *, fan_w_per_kg_s: Values = FAN_W_PER_KG_S) -> Values:
-    """Fan power at full speed from the design water flow (Modelica Buildings, YorkCalc), W.
-
-    Args:
-        water_kg_s: Condenser water flow at design, kg/s, (B,).
-        fan_w_per_kg_s: Fan power per water flow, W/(kg/s).
-    """
-    return fan_w_per_kg_s * water_kg_s
 
 
 def fan_power_w(air_ratio: Values, *, design_fan_w: Values) -> Values:

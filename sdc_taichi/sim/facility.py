@@ -21,8 +21,7 @@ from sdc_taichi.plant.battery import (
     BatteryResult,
 )
 from sdc_taichi.plant.chiller import CHILLERS
-from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh, power_path_loss_w
-from sdc_taichi.plant.fans_pumps import crac_fan_w
+from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
@@ -202,7 +201,7 @@ class Facility:
                 **self._flow_limits,
             )
         )
-        full_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
+        full_w = cooling.crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
         fan_w = self._while_powered(full_w, inputs.surroundings)
         return_c, load_w = self._load.step(
             cooling.HallPoint(
@@ -320,10 +319,10 @@ class Facility:
         """Losses of UPS and distribution, which have no power while the data center has none."""
         path = self._sizing.power_path
         if self._event_free:
-            ups_w, distribution_w = power_path_loss_w(it_w, path)
+            ups_w, distribution_w = path.losses_w(it_w)
         else:
             on = np.where(inputs.surroundings.powered > 0, inputs.surroundings.powered, 1.0)
-            ups_w, distribution_w = power_path_loss_w(it_w / on, path)
+            ups_w, distribution_w = path.losses_w(it_w / on)
         return (
             self._while_powered(as_array(ups_w), inputs.surroundings),
             self._while_powered(as_array(distribution_w), inputs.surroundings),

@@ -13,11 +13,10 @@ from sdc_taichi.kernels.arguments import row_index
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
 from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters, ChillerPoint, ChillerResult
-from sdc_taichi.plant.electrical import NO_LIMIT_KW, PowerPath, loss_w, power_path_loss_w
-from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
+from sdc_taichi.plant.electrical import NO_LIMIT_KW, LossyDevice, PowerPath
 from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.plant.tower import TOWERS, TowerDesignPoint, design_water_kg_s
-from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.plant.water_side import WaterSideDesign, hydraulic_pump_w
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64, fields_of
@@ -96,7 +95,7 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 
 def _check_sizes(fleet: Fleet, found: Sizing) -> None:
     """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
-    sizes = fields_of(found) | fields_of(found.water_side) | fields_of(found.power_path)
+    sizes = fields_of(found) | fields_of(found.water_side)
     for name, values in sizes.items():
         if name in ("water_side", "power_path", "machine") or name.endswith("_c"):
             continue
@@ -485,26 +484,16 @@ def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
 
 def _power_path(fleet: Fleet, it_w: F64) -> tuple[PowerPath, F64]:
     """UPS and distribution for an IT power, W, (B,), and the losses there that count, W, (B,)."""
-    v = fleet.values
-    ratio = v("electrical.capacity_ratio")
-    shares = {
-        f"{device}_{name}": v(f"electrical.{device}.{name}")
-        for device in ("ups", "distribution")
-        for name in ("no_load_share", "proportional_share", "square_share")
-    }
-    distribution_w = ratio * it_w
-    behind_ups_w = it_w + loss_w(
-        it_w,
-        distribution_w,
-        no_load_share=shares["distribution_no_load_share"],
-        proportional_share=shares["distribution_proportional_share"],
-        square_share=shares["distribution_square_share"],
-    )
-    path = PowerPath(
-        ups_rated_w=np.asarray(ratio * behind_ups_w), distribution_rated_w=distribution_w, **shares
-    )
+
+    def device(name: str, carried_w: F64) -> LossyDevice:
+        rated_w = fleet.values("electrical.capacity_ratio") * carried_w
+        shares = LossyDevice._fields[1:]
+        return LossyDevice(rated_w, *(fleet.values(f"electrical.{name}.{s}") for s in shares))
+
+    distribution = device("distribution", it_w)
+    path = PowerPath(device("ups", np.asarray(it_w + distribution.loss_w(it_w))), distribution)
     counted = fleet.configs[0].electrical.losses == "counted"
-    return path, np.asarray(sum(power_path_loss_w(it_w, path)) if counted else 0.0 * it_w)
+    return path, np.asarray(sum(path.losses_w(it_w)) if counted else 0.0 * it_w)
 
 
 def _grid_limit_kw(fleet: Fleet, design_kw: F64) -> F64:
