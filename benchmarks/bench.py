@@ -3,8 +3,8 @@
     python benchmarks/bench.py [--quick] [--out runs/bench]
 
 Prints tables, and writes them as bench.json and bench.md, and cost against size as bench.png.
-Speed is judged by ratios of core time alone: to the two yardsticks of yardsticks.py, to peers, or
-to the same work done otherwise. Steps per second and seconds are printed beside the ratios, since
+Speed is judged by ratios of core time alone: to the two yardsticks of yardsticks.py, or to
+the same work in C. Steps per second and seconds are printed beside the ratios, since
 they belong to the machine and the hour. Nothing here fails for being slow: "met" and "not met" are
 for people to read.
 """
@@ -28,7 +28,7 @@ from typing import Any
 import fresh
 import numpy as np
 import steps
-from peers import PEERS, Arguments, MissingError
+from peer import Arguments, MissingError, c_step
 from yardsticks import core_ratios, core_s, interpreter_loop, plain_store
 
 import sdc_taichi
@@ -41,11 +41,9 @@ HERE = Path(__file__).parent
 LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo")
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
 QUICK_SIZES = ((4, 20, 200), (1, 400, 40))
-"""Data centers, racks of each and servers of a rack of the halls beside peers."""
+"""Data centers, racks of each and servers of a rack of the halls beside the peer."""
 CURVE = (3, 25, 250, 2500, 25_000)
 """Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
-BYTES_PER_SERVER_AT_WORK = 30
-"""Of the largest size: layers, and what its build takes at the most."""
 
 
 @dataclass(frozen=True)
@@ -88,30 +86,18 @@ def number(value: float) -> str:
 
 def child(part: str, *arguments: Any, **variables: str) -> Any:
     """Result of a function of fresh.py, which runs in a new process."""
-    return result(start(part, *arguments, **variables))
-
-
-def result(process: subprocess.Popen[str]) -> Any:
-    """Result that a process of fresh.py prints."""
-    printed = process.communicate()[0]
-    if process.returncode:
-        raise SystemExit(f"benchmarks/fresh.py ended with exit code {process.returncode}")
-    return json.loads(printed.splitlines()[-1])
-
-
-def start(part: str, *arguments: Any, **variables: str) -> subprocess.Popen[str]:
-    """A process of fresh.py that runs one of its functions."""
-    return subprocess.Popen(
+    done = subprocess.run(
         [sys.executable, str(HERE / "fresh.py"), part, json.dumps(arguments)],
+        check=True,
         env=os.environ | variables,
-        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def kernel_and_peers(quick: bool) -> Iterator[Figure]:
-    """Flat halls: share of the memory roof, reduction alone, and the peers."""
+def kernel_and_peer(quick: bool) -> Iterator[Figure]:
+    """Flat halls: share of the memory roof, reduction alone, and the same work in C."""
     threads, rounds = runtime.ensure_started(), 1 if quick else 20
     fleets = {
         " x ".join(map(str, size)): steps.fleet_of(*size, "approach")
@@ -123,25 +109,21 @@ def kernel_and_peers(quick: bool) -> Iterator[Figure]:
         sdc_taichi.make_configs(unlike, count=count)
     )
     for name, fleet in fleets.items():
-        yield from beside_peers(name, fleet, threads, rounds)
+        yield from beside_peer(name, fleet, threads, rounds)
 
 
-def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator[Figure]:
+def beside_peer(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator[Figure]:
     """Figures of one fleet: medians over the rounds of times and of their ratios."""
     alike, conditions = fleet.groups < fleet.servers, steps.conditions(fleet)
     hall = Hall(fleet, "f32")
     sums, layers = hall.solve(conditions), hall.servers()
     reduction, whole = steps.stepped(fleet)
     calls = {"roof": plain_store(fleet.servers), "reduction": reduction, "step": whole}
-    peers = {}
-    for peer, make in PEERS.items():
-        arguments = Arguments(fleet, conditions)
-        try:
-            calls[peer] = make(arguments, threads)
-        except MissingError as error:
-            yield Figure("kernel", f"{name}: {peer}", None, note=f"skipped: {error}")
-        else:
-            peers[peer] = arguments
+    arguments = Arguments(fleet, conditions)
+    try:
+        calls["c"] = c_step(arguments, threads)
+    except MissingError as error:
+        yield Figure("kernel", f"{name}: C", None, note=f"skipped: {error}")
     spent_s = core_s(calls, rounds)
 
     def each(what: str, called: str) -> Figure:
@@ -160,18 +142,17 @@ def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator
     ):
         limits = (at_most, at_least) if alike else ()
         yield Figure("kernel", f"{name}: {called}", over(what, other), "", *limits)
-    slowest = 1.6 if alike else 2.2
-    for peer, arguments in peers.items():
-        where = f"{name}: {peer}"
-        yield each(peer, peer)
-        yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=slowest)
+    if "c" in calls:
+        yield each("c", "C")
+        slowest = 1.6 if alike else 2.2
+        yield Figure("kernel", f"{name}: C, ours over it", over("step", "c"), at_most=slowest)
         summed = np.stack([sums.cpu_w, sums.it_fan_w, sums.it_airflow_m3s])
         apart = difference(arguments, layers, summed)
-        yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
+        yield Figure("kernel", f"{name}: C, largest difference", apart, "relative", at_most=1e-5)
 
 
 def difference(arguments: Arguments, layers: ServerLayers, sums: Any) -> float:
-    """Largest relative difference of a peer's layers and sums from ours."""
+    """Largest relative difference of the peer's layers and sums from ours."""
     pairs = [
         (arguments.layers.inlet_c, layers.inlet_c),
         (arguments.layers.outlet_c, layers.outlet_c),
@@ -268,9 +249,6 @@ def scaling(quick: bool) -> Iterator[Figure]:
     per_server = {}
     for count in CURVE[:3] if quick else CURVE:
         servers = 4000 * count
-        if servers * BYTES_PER_SERVER_AT_WORK > free_bytes():
-            yield Figure("scaling", size_name(servers), None, note="skipped: too little memory")
-            continue
         fleet = steps.fleet_of(count, 20, 200, "approach")
         step = steps.stepped(fleet)[1]
         per_server[servers] = 1e9 * wall_s(step, repeats) / servers
@@ -286,7 +264,6 @@ def scaling(quick: bool) -> Iterator[Figure]:
     larger = costs[2:] or costs
     spread = max(larger) / min(larger)
     yield Figure("scaling", "dearest size over cheapest from 1e6 servers on", spread, at_most=3.0)
-    yield from side_by_side(quick)
     if not fresh.MEMORY.exists():
         yield Figure("scaling", "memory", None, note="skipped: read from /proc, which is Linux's")
         return
@@ -302,63 +279,6 @@ def scaling(quick: bool) -> Iterator[Figure]:
     count = 10 if quick else 10_000
     grown = child("cycles", count) / 2**20
     yield Figure("scaling", f"growth over {count:,} reset and close cycles", grown, "MB", 1.0)
-
-
-def side_by_side(quick: bool) -> Iterator[Figure]:
-    """Two threads, and two processes of one thread, over one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    if (cores or 1) < 2:
-        yield Figure("scaling", "two threads over one", None, note="skipped: one core")
-        return
-    seconds, rounds = (0.01, 1) if quick else (1.0, 3)
-    size = [16, 20, 200] if quick else [4096, 20, 200]
-    hall, batch = " x ".join(map(str, size)), f"N = {size[0]}"
-
-    def gains(what: str) -> tuple[float, float]:
-        """Steps per second of two threads, and of two processes, over one; medians."""
-        # The three of a round follow each other: what comes from outside meets all of them.
-        per_s = np.array(
-            [
-                [rates(what, size, seconds, *how) for how in ((1, 1), (1, 2), (2, 1))]
-                for _ in range(rounds)
-            ]
-        )
-        threads, processes = np.median(per_s[:, 1:] / per_s[:, :1], axis=0).tolist()
-        return threads, processes
-
-    stores, computes = gains("roof")[1], gains("interpreter")[1]
-    yield Figure("scaling", "memory roof, two processes over one", stores)
-    yield Figure("scaling", "interpreter yardstick, two processes over one", computes)
-    for what, shape, gain, which in (
-        *(() if quick else (("step with layers", hall, stores, "the roof's"),)),
-        *(() if quick else (("reduction", hall, computes, "the interpreter's"),)),
-        ("environments", batch, computes, "the interpreter's"),
-    ):
-        threads, processes = gains(what)
-        for name, times, least in (
-            ("two threads", threads, 0.5),
-            ("two processes", processes, 0.7),
-        ):
-            where = f"{what} {shape}, gain by {name} over {which}"
-            beside = f"{number(times)} times"
-            yield Figure("scaling", where, times / gain, at_least=least, absolute=beside)
-
-
-def rates(what: str, size: list[int], seconds: float, processes: int, threads: int) -> float:
-    """Steps per second of all processes at the same time."""
-    running = [
-        start("rate", what, size, seconds, SDC_TAICHI_THREADS=str(threads))
-        for _ in range(processes)
-    ]
-    for process in running:
-        assert process.stdout is not None
-        while (line := process.stdout.readline()) and line != "ready\n":
-            pass
-    for process in running:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-    return float(sum(result(process) for process in running))
 
 
 def size_name(servers: int) -> str:
@@ -379,15 +299,6 @@ def wall_s(call: Callable[[], object], repeats: int) -> float:
             call()
         spent.append((time.perf_counter() - begin) / times)
     return min(spent)
-
-
-def free_bytes() -> int:
-    """Free memory in bytes; a GiB where the system does not report it."""
-    try:
-        line = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
-    except OSError:
-        return 2**30
-    return 1024 * int(line[1]) if line else 2**30
 
 
 def starting(quick: bool) -> Iterator[Figure]:
@@ -540,31 +451,21 @@ def markdown(figures: list[Figure], quick: bool) -> str:
 
 
 def plot(figures: list[Figure], path: Path) -> None:
-    """Cost per server against size, with the memory roof at all threads."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Draw cost per server against size, beside the memory roof at all threads."""
     from matplotlib.figure import Figure as Canvas
-    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-    points = [
-        (float(f.name.split()[0]), f.value)
+    costs = {
+        float(f.name.split()[0]): f.value
         for f in figures
-        if f.unit == "ns/server" and f.part == "scaling" and f.value is not None
-    ]
+        if f.unit == "ns/server" and f.part == "scaling"
+    }
     roofs = [f.value for f in figures if f.name.endswith(": memory roof") and f.value is not None]
     canvas = Canvas(figsize=(6.4, 4.0), layout="constrained")
-    FigureCanvasAgg(canvas)
     axes = canvas.subplots()
-    axes.loglog(*zip(*points, strict=True), "o-", color="#0072b2", label="step with layers")
-    axes.axhline(
-        min(roofs) / runtime.ensure_started(), color="#d55e00", ls="--", label="memory roof"
-    )
-    axes.set_xlabel("servers")
-    axes.set_ylabel("wall time per server and step [ns]")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_title("Halls of 4,000 servers, inlet model approach")
-    axes.grid(which="major", alpha=0.3)
+    axes.loglog(*zip(*costs.items(), strict=True), "o-", label="step with layers")
+    axes.axhline(min(roofs) / runtime.ensure_started(), color="C1", ls="--", label="memory roof")
+    axes.set(xlabel="servers", ylabel="wall time per server and step [ns]")
+    axes.grid(alpha=0.3)
     axes.legend()
     canvas.savefig(path, dpi=150)
 
@@ -583,7 +484,7 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    parts = environments, planned, kernel_and_peers, calls, scaling, starting, optima, recording
+    parts = environments, planned, kernel_and_peer, calls, scaling, starting, optima, recording
     for part in parts:
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)

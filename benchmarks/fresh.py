@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import steps
-from yardsticks import core_s, interpreter_loop, plain_store
+from yardsticks import core_s, interpreter_loop
 
 import sdc_taichi
 
@@ -124,26 +124,8 @@ def cycles(count: int) -> float:
     return float(resident() - before)
 
 
-def rate(what: str, size: list[int], seconds: float) -> float:
-    """Steps of ``size`` per second from when a line comes in, which answers ``ready``."""
-    if what == "environments":
-        call: Callable[[], object] = steps.environment_step(size[0])
-    elif what == "roof":
-        call = plain_store(int(np.prod(size)))
-    elif what == "interpreter":
-        call = interpreter_loop()
-    else:
-        reduction, whole = steps.stepped(steps.fleet_of(size[0], size[1], size[2], "approach"))
-        call = reduction if what == "reduction" else whole
-    for _ in range(3):
-        call()
-    print("ready", flush=True)
-    sys.stdin.readline()
-    return steps.rate(call, 1, seconds)
-
-
 PARTS: dict[str, Callable[..., Any]] = {
-    f.__name__: f for f in (first_step, optimum, memory, cycles, rate)
+    f.__name__: f for f in (first_step, optimum, memory, cycles)
 }
 
 if __name__ == "__main__":

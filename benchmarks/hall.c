@@ -1,4 +1,4 @@
-/* One step of halls with inlet model "approach", for benchmarks/peers.py: the equations of
+/* One step of halls with inlet model "approach", for benchmarks/peer.py: the equations of
    kernels/thermal.py for a linear, cubic fan and outlet model "server". Groups of alike servers are
    computed once and copied to their servers; where every server is a group, all are computed. */
 #include <stdint.h>

@@ -79,9 +79,9 @@ def test_scores_are_0_for_idle_commands_and_1_for_the_optimum(root: Path) -> Non
     assert minari.get_normalized_score(data, best) == pytest.approx(1.0)
     assert data.storage.metadata["ref_min_score"] < best
     card = (root / ID / "README.md").read_text(encoding="utf-8")
-    assert "| `optimum` | 2 | 192 |" in card
-    assert "| 57 | `dc_load` |" in card  # the last of 58 entries
-    assert "| 2 | agent_bat | battery |" in card
+    assert "| optimum | 2 | 192 |" in card
+    assert "| 57 | dc\\_load |" in card  # the last of 58 entries
+    assert "| 2 | agent\\_bat | battery |" in card
 
 
 @pytest.mark.repo

@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sdc_taichi.benchmark.episodes import Collection, Episode, objective_of_optimum
 from sdc_taichi.benchmark.jobs import input_paths
 from sdc_taichi.envs.vector import SdcVectorEnv
+from sdc_taichi.learning.evaluation_table import literal_markdown, markdown
 from sdc_taichi.run.processor import processor_features
 from sdc_taichi.sim.fleet_configs import locations
 
 _SCALED = (
     "An entry is (value - low) / (high - low), or value / high where the range lies evenly about "
     "zero; values beyond the range are cut at it."
+)
+_CONTROLLER_COLUMNS = (
+    *("controller", "episodes", "steps", "mean return", "score (%)"),
+    *("carbon against idle (%)", "cost against idle (%)", "commands changed (%)"),
+)
+_CONTROLLERS = (
+    "Changes of carbon and energy cost are of the sums of all episodes; work that waits or energy "
+    "that is stored at their ends has no value. Commands changed are those that the nearest action "
+    "of the environment gives otherwise than the controller did. `random` draws actions evenly "
+    "from the action space."
+)
+_SCORES = (
+    "A score is 0 at the mean return of idle commands and 100 % at that of `{}`, which knows all "
+    "inputs in advance; `ref_min_score` and `ref_max_score` are these returns."
 )
 _LOADING = """\
 ```python
@@ -52,7 +69,7 @@ class ControllerReturns:
     """Sum of each quantity of infos over all steps, by name."""
 
     def add(self, episode: Episode) -> None:
-        """Take an episode into account."""
+        """Add the rewards and quantities of an episode."""
         self.returns.append(float(episode.rewards.sum()))
         self.steps += len(episode.rewards)
         self.changed_commands += episode.changed_commands
@@ -106,170 +123,124 @@ def is_optimum(controller: str) -> bool:
 
 
 def card(made: DataSet, command: str) -> str:
-    """The card as Markdown.
+    """The card of a data set as Markdown.
 
     Args:
         made: the data set.
         command: command line that makes it again; empty if there is none.
     """
-    collection = made.collection
-    with closing(collection.make_batch(1)) as env:
-        facts = _facts(made, env)
-        observations = _observations(env)
-        actions = _actions(env)
-        scaled = env.core.options.observations == "default"
-        sources = env.core.sim.drivers.sources[0]
-        synthetic = env.core.sim.drivers.synthetic[0] and not input_paths(collection.config)
-    loading = _LOADING.format(id=made.id, folder=made.id, version=version("sdc-taichi"))
-    parts = [
-        f"# {made.id}",
-        f"Episodes of a simulated data center under {len(made.controllers)} controllers, for "
-        "offline reinforcement learning, in the format of Minari.",
-        _table(("", ""), facts),
-        "## Controllers",
-        _table(*_controllers(made)),
-        _about_controllers(made),
-        "## Observations",
-        _SCALED if scaled else "",
-        _table(("entries", "feature", "meaning", "unit", "range"), observations),
-        "## Actions",
-        _table(("entries", "agent", "command"), actions),
-        f"The documentation of environments explains the commands. Infos of each step: "
-        f"{', '.join(f'`{name}`' for name in made.idle.totals)}.",
-        "## Loading",
-        loading,
-        "## Making it again",
-        f"    {command}" if command else "",
-        "Equal seeds give equal episodes, to the bit on processors with the same features and with "
-        "the same versions of the libraries.",
-        "## Licence",
-        _licence(sources, synthetic=synthetic),
-    ]
+    with closing(made.collection.make_batch(1)) as env:
+        parts = [
+            f"# {made.id}",
+            f"Episodes of a simulated data center under {len(made.controllers)} controllers, for "
+            "offline reinforcement learning, in the format of Minari.",
+            _table(("fact", "value"), _facts(made, env)),
+            "## Controllers",
+            _table(_CONTROLLER_COLUMNS, _controllers(made)),
+            _SCORES.format(made.best.controller) if made.best is not None else "",
+            _CONTROLLERS,
+            "## Observations",
+            _SCALED if env.core.options.observations == "default" else "",
+            _table(("entries", "feature", "meaning", "unit", "range"), _observations(env)),
+            "## Actions",
+            _table(("entries", "agent", "commands"), _actions(env)),
+            "The documentation of environments explains the commands. Infos of each step: "
+            f"{', '.join(f'`{name}`' for name in made.idle.totals)}.",
+            "## Loading",
+            _LOADING.format(id=made.id, folder=made.id, version=version("sdc-taichi")),
+            "## Making it again",
+            f"    {command}" if command else "",
+            "Equal seeds give equal episodes, to the bit on processors with the same features and "
+            "with the same versions of the libraries.",
+            "## Licence",
+            _licence(made.collection, env),
+        ]
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, str]]:
-    """Names and values of what the data set holds, in a few words each."""
-    collection, options = made.collection, env.core.options
-    episodes = sum(each.episodes for each in made.controllers)
-    steps = sum(each.steps for each in made.controllers)
-    (place,) = locations([collection.config])
-    rewards = options.rewards if isinstance(options.rewards, str) else "of the options"
-    each_week = "" if collection.repeats == 1 else f", {collection.repeats} episodes of each"
+def _table(titles: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table in Markdown."""
+    import pandas as pd
+
+    return markdown(pd.DataFrame(rows, columns=list(titles)))
+
+
+def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, Any]]:
+    """Names and values of facts about a data set."""
+    collection, rewards = made.collection, env.core.options.rewards
     return [
-        ("environment", f"`{collection.environment_id}`, with all arguments in its spec"),
-        ("data center", f"{_text(collection.config.name)}, site {_text(place)}"),
-        ("episodes", f"{episodes:,}, cut off after {env.core.steps:,} steps and never over"),
-        ("steps", f"{steps:,} of {60 // env.core.sim.fleet.steps_per_hour} min"),
-        ("weeks", f"{', '.join(map(str, collection.weeks))} of the year, from 0{each_week}"),
+        ("environment", f"{collection.environment_id}, with all arguments in its spec"),
+        ("data center", f"{collection.config.name}, site {locations([collection.config])[0]}"),
+        ("episodes", str(sum(each.episodes for each in made.controllers))),
+        ("steps of an episode", f"{env.core.steps}, after which it is cut off"),
+        ("length of a step", f"{60 // env.core.sim.fleet.steps_per_hour} min"),
+        ("weeks", f"{', '.join(map(str, collection.weeks))} of the year, from 0"),
         ("seeds", f"{collection.seed} + week, and 52 more for each further episode of a week"),
         ("observation", f"{sum(each.size for each in env.features)} numbers (float32)"),
-        ("action", f"`{env.single_action_space}`".replace("\n", " ")),
-        ("reward", f"{_text(str(rewards))}, undiscounted sum in the table below"),
+        ("action", str(env.single_action_space)),
+        ("reward", rewards if isinstance(rewards, str) else "of the options"),
         ("made by", f"sdc-taichi {version('sdc-taichi')}, Minari {version('minari')}"),
         ("processor", ", ".join(f"{name} {value}" for name, value in processor_features().items())),
     ]
 
 
-def _controllers(made: DataSet) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Titles and rows of the table of controllers."""
-    titles = (
-        *("controller", "episodes", "steps", "mean return", "score (%)"),
-        *("carbon against idle (%)", "cost against idle (%)", "commands changed (%)"),
-    )
-    listed = made.controllers
-    if not any(each.controller == made.idle.controller for each in listed):
-        listed = (made.idle, *listed)
-    rows: list[tuple[str, ...]] = []
-    for each in listed:
-        is_in_set = each in made.controllers
+def _controllers(made: DataSet) -> Iterator[tuple[Any, ...]]:
+    """Rows of the table of controllers, one of idle commands among them."""
+    names = [each.controller for each in made.controllers]
+    reference = [] if made.idle.controller in names else [made.idle]
+    for each in [*reference, *made.controllers]:
         score = made.score(each.mean_return)
-        rows.append(
-            (
-                f"`{_text(each.controller)}`" if is_in_set else f"`{each.controller}` (not in it)",
-                f"{each.episodes:,}" if is_in_set else "",
-                f"{each.steps:,}" if is_in_set else "",
-                f"{each.mean_return:.2f}",
-                "" if score is None else f"{100.0 * score:.1f}",
-                _change_pct(each, made.idle, "carbon_g"),
-                _change_pct(each, made.idle, "energy_cost"),
-                f"{100.0 * each.changed_commands / each.episodes:.1f}",
-            )
+        yield (
+            each.controller if each.controller in names else f"{each.controller} (not in it)",
+            each.episodes,
+            each.steps,
+            each.mean_return,
+            math.nan if score is None else 100.0 * score,
+            _change_pct(each, made.idle, "carbon_g"),
+            _change_pct(each, made.idle, "energy_cost"),
+            100.0 * each.changed_commands / each.episodes,
         )
-    return titles, rows
 
 
-def _about_controllers(made: DataSet) -> str:
-    """How to read the table of controllers."""
-    text = (
-        "Changes of carbon and energy cost are of the sums over all episodes; what waits or is "
-        "stored at their ends is not valued. Commands changed are those that the nearest action "
-        "of the environment gives otherwise than the controller did. `random` draws actions "
-        "evenly from the action space."
-    )
-    if made.best is None:
-        return text
-    return (
-        f"A score is 0 at the mean return of idle commands and 100 % at that of "
-        f"`{made.best.controller}`, which knows all inputs in advance; `ref_min_score` and "
-        f"`ref_max_score` are these returns. {text}"
-    )
-
-
-def _observations(env: SdcVectorEnv) -> list[tuple[str, ...]]:
+def _observations(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
     """Features, in the order of their entries."""
-    rows: list[tuple[str, ...]] = []
     first = 0
     for each in env.features:
-        entries, what = _entries(first, each.size), each.description.replace("|", "/")
-        rows.append((entries, f"`{each.name}`", what, each.unit, f"{each.low:g}..{each.high:g}"))
+        range_text = f"{each.low:g}..{each.high:g}"
+        yield _entries(first, each.size), each.name, each.description, each.unit, range_text
         first += each.size
-    return rows
 
 
-def _actions(env: SdcVectorEnv) -> list[tuple[str, ...]]:
+def _actions(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
     """Agent and commands of the entries of an action."""
-    core = env.core
-    rows: list[tuple[str, ...]] = []
     first = 0
-    for agent in core.agents:
-        size = int(np.prod(core.action_spaces[agent].shape or ()))
-        rows.append((_entries(first, size), agent, ", ".join(core.options.commands_of(agent))))
+    for agent in env.core.agents:
+        size = int(np.prod(env.core.action_spaces[agent].shape or ()))
+        yield _entries(first, size), agent, ", ".join(env.core.options.commands_of(agent))
         first += size
-    return rows
 
 
 def _entries(first: int, size: int) -> str:
-    """Numbers of entries that stand side by side."""
+    """Numbers of adjacent entries of a vector, as text."""
     return str(first) if size == 1 else f"{first}-{first + size - 1}"
 
 
-def _licence(sources: dict[str, str], *, synthetic: bool) -> str:
-    """Whose data the episodes are made from."""
-    if synthetic:
+def _licence(collection: Collection, env: SdcVectorEnv) -> str:
+    """Text on the data that the episodes are made from."""
+    drivers = env.core.sim.drivers
+    if drivers.synthetic[0] and not input_paths(collection.config):
         return (
             "Weather, carbon intensity and work are synthetic years, generated from figures that "
             "are part of sdc-taichi (MIT licence). No measured row is in this data set."
         )
-    listed = "; ".join(f"{kind}: {_text(source)}" for kind, source in sources.items())
+    sources = "; ".join(f"{kind}: {source}" for kind, source in drivers.sources[0].items())
     return (
-        f"Observations follow from these inputs, whose licences apply to what is published: "
-        f"{listed}."
+        "Observations follow from these inputs, whose licences apply to what is published: "
+        f"{literal_markdown(sources)}."
     )
 
 
-def _change_pct(reached: ControllerReturns, idle: ControllerReturns, name: str) -> str:
-    """Change of a sum against that of idle commands, in %; empty where that is 0."""
+def _change_pct(reached: ControllerReturns, idle: ControllerReturns, name: str) -> float:
+    """Change of a sum against that of idle commands, in %; nan where that is 0."""
     base = idle.totals.get(name, 0.0)
-    return f"{100.0 * (reached.totals[name] / base - 1.0):+.2f}" if base else ""
-
-
-def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [titles, ["---"] * len(titles), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def _text(text: str) -> str:
-    """Text of the user's that breaks neither a line nor a table."""
-    return " ".join(text.split()).replace("|", "/").replace("`", "'")
+    return 100.0 * (reached.totals[name] / base - 1.0) if base else math.nan

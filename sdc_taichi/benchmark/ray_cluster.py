@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -27,8 +26,6 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError, one_line
 
 LOCAL = "local"
 """Address of a cluster that is started on this machine, and ends with the study."""
-ANSWER_S = 15
-"""Time in which a cluster has to answer, in s; Ray itself tries for minutes."""
 _POLL_S = 0.2
 
 
@@ -130,15 +127,16 @@ class RayCluster(Executor):
         Raises:
             ConfigError: there is none at the address.
         """
-        if self._address != LOCAL:
-            _require_answer(self._address)
         handler = signal.getsignal(signal.SIGTERM)
         try:
             self._ray.init(
                 self._address, log_to_driver=False, logging_level="error", **self._started
             )
         except (OSError, RuntimeError, ValueError) as error:
-            raise ConfigError(f"--ray {self._address}: {_reason(error)}") from error
+            raise ConfigError(
+                f"--ray {self._address}: {_reason(error)}; valid is the HOST:PORT that `ray start "
+                f"--head` prints, auto for the cluster that runs here, or {LOCAL} for a new one"
+            ) from error
         finally:
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, handler)  # Ray sets its own
@@ -164,25 +162,3 @@ def _run(job: Job, path: Sequence[str], *contents: bytes) -> DoneJob:
 def _reason(error: object) -> str:
     """The first sentence of an error of Ray, whose texts are long."""
     return one_line(str(error)).partition(". ")[0]
-
-
-def _require_answer(address: str) -> None:
-    """Ask a cluster for its status in a separate process, because Ray itself has no time limit.
-
-    Raises:
-        ConfigError: it does not answer.
-    """
-    command = [sys.executable, "-m", "ray.scripts.scripts", "status", "--address", address]
-    text = f"no Ray cluster answers within {ANSWER_S} s"
-    try:
-        asked = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S)
-        if asked.returncode == 0:
-            return
-        said = (asked.stderr + asked.stdout).strip().splitlines()
-        text += f" ({_reason(said[-1])})" if said else ""
-    except subprocess.TimeoutExpired:
-        pass
-    raise ConfigError(
-        f"--ray {address}: {text}; valid is the HOST:PORT that `ray start --head` prints, auto for "
-        f"the cluster that runs here, or {LOCAL} for a new one"
-    )
