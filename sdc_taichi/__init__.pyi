@@ -13,8 +13,8 @@ from .envs.options import EnvOptions as EnvOptions
 from .envs.parallel import aec_env as aec_env
 from .envs.parallel import parallel_env as parallel_env
 from .envs.recording import EpisodeRecorder as EpisodeRecorder
-from .envs.recording import RecordEpisodes as RecordEpisodes
 from .envs.rewards import register_reward as register_reward
+from .envs.vector import RecordEpisodes as RecordEpisodes
 from .envs.vector import vector_env as vector_env
 from .errors import ConfigError as ConfigError
 from .errors import DataError as DataError

@@ -322,7 +322,7 @@ def test_goes_on_from_what_was_saved(saved_after: int) -> None:
     assert same(trajectory(other, None, STEPS + 10), expected)
 
 
-def test_single_environments_go_on_from_what_was_saved() -> None:
+def test_agents_of_a_saved_episode() -> None:
     action = {"agent_ls": 0, "agent_dc": 2, "agent_bat": 0}
     env, other = (sdc_taichi.parallel_env(**tiny()) for _ in range(2))
     env.reset(seed=1)
@@ -338,18 +338,6 @@ def test_single_environments_go_on_from_what_was_saved() -> None:
     other.load_state_dict(saved)
     assert other.agents == list(AGENTS)
     assert same(other.step(action), env.step(action))
-
-    makers: list[Callable[[], Any]] = [
-        lambda: gymnasium.make("sdc_taichi/Joint-v0", **tiny()).unwrapped,
-        lambda: gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
-    ]
-    for make in makers:
-        one, two = make(), make()
-        one.reset(seed=3)
-        begun = one.step(one.action_space.sample())
-        assert same(two.load_state_dict(one.state_dict()), begun[0])
-        action_of_both = one.action_space.sample()
-        assert same(two.step(action_of_both), one.step(action_of_both))
 
 
 def test_a_state_is_not_changed_by_going_on() -> None:
@@ -583,61 +571,6 @@ def test_without_autoreset_a_batch_waits_for_reset(kind: str) -> None:
     else:
         env.reset()
     env.step(hold)
-
-
-# --- saved states that do not fit ---
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"config": "corrected"}, "another fleet"),
-        ({"days": 2}, "made with days 1; valid is 2, as here"),
-        ({"agents": ["agent_bat"]}, "made with agents"),
-        ({"actions": "continuous"}, "made with actions 'discrete'"),
-        ({"forecast_error": ForecastError(0.1)}, "made with forecast_error"),
-        ({"rewards": {"agent_dc": {"pue": 1.0}}}, "made with rewards {"),
-        ({"rewards": lambda result, view: -result.grid_kwh}, "made with rewards {"),
-        ({"tariff": {"price_per_kwh": [0.1]}}, "made with tariff"),
-    ],
-)
-def test_saved_by_another_environment(options: dict[str, Any], message: str) -> None:
-    env, other = sdc_taichi.parallel_env(**tiny()), sdc_taichi.parallel_env(**tiny(**options))
-    env.reset(seed=0)
-    with pytest.raises(SdcError, match=re.escape(message)):
-        other.load_state_dict(env.state_dict())
-    with pytest.raises(SdcError, match="made by 1 environments; valid is 2"):
-        multi_agent(2, **tiny()).load_state_dict(env.state_dict())
-
-
-HELD = {name: np.zeros(2) for name in ("load", "cooling", "battery")}
-
-
-@pytest.mark.parametrize(
-    ("part", "value", "message"),
-    [
-        ("more", 1, r"state: parts are \[.*; valid is \['actions', "),
-        ("options", None, "options is a NoneType"),
-        ("simulator", {}, "snapshot: missing"),
-        ("generators", [{}, {}], "generator 0 is not valid"),
-        ("keys", np.array([1.5, 2.0]), "keys are float64"),
-        ("keys", np.array([1, 2, 3]), r"keys are int64 \(3,\)"),
-        ("rewards", np.full((2, 2), np.nan), "valid is powers of 0"),
-        ("actions", None, "no actions after 4 steps"),
-        ("actions", {"jump": np.zeros(2)}, r"actions are \['jump'\]; valid is a dict"),
-        ("actions", {**HELD, "load": np.array([2.0, 0.0])}, "load are .*; valid is within -1..1"),
-        ("actions", {**HELD, "load": np.zeros(3)}, r"actions of load are float64 \(3,\)"),
-    ],
-)
-def test_a_malformed_state_leaves_the_environment_unchanged(
-    part: str, value: Any, message: str
-) -> None:
-    env, twin, other = (multi_agent(2, **tiny()) for _ in range(3))
-    for one, steps in ((env, 3), (twin, 3), (other, 5)):
-        trajectory(one, one.reset(seed=2), steps)
-    with pytest.raises(SdcError, match=message):
-        env.load_state_dict({**other.state_dict(), part: value})
-    assert same(trajectory(env, None, 20), trajectory(twin, None, 20))
 
 
 # --- malformed arguments ---

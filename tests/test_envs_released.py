@@ -29,9 +29,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.control.view import View, view_maker
-from sdc_taichi.envs import released_rewards
-from sdc_taichi.envs.released import FEATURES, ReleasedObserver
-from sdc_taichi.envs.released_rewards import ReleasedRewards
+from sdc_taichi.envs import released
+from sdc_taichi.envs.released import FEATURES, ReleasedObserver, ReleasedRewards
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Precision
@@ -344,7 +343,7 @@ def test_batch_equals_alone(preset: str) -> None:
 def test_load_penalty_by_hand(
     quarter_hour: int, dropped: float, queue: float, expected: float
 ) -> None:
-    found = released_rewards.load_penalty(
+    found = released.load_penalty(
         np.array([dropped]), np.array([queue]), np.array([quarter_hour / 96])
     )
     assert found.tolist() == pytest.approx([expected], rel=1e-6)
@@ -356,7 +355,7 @@ def test_load_bounds_of_recorded_runs(name: str, path: Path) -> None:
     config = rack_config(about["racks"], about["config"]["location"])
     with Simulator(config, drivers=drivers(inputs(0), start=[0]), precision="f64") as sim:
         sim.reset()
-        low, high = released_rewards.power_bounds_kw(sim.fleet, sim.sizing, "f64")
+        low, high = released.power_bounds_kw(sim.fleet, sim.sizing, "f64")
     assert low.tolist() == pytest.approx([about["sizing"]["power_lb_kw"]], rel=1e-9), name
     assert high.tolist() == pytest.approx([about["sizing"]["power_ub_kw"]], rel=1e-9), name
 
@@ -370,7 +369,7 @@ def test_rewards_of_a_run() -> None:
     actions = [replace(some_actions(rng, 1), load=LOAD[0]) for _ in range(40)]
     with Simulator(load_config("sustaindc"), drivers=drivers(series, start=[start])) as sim:
         _, rewards, results, _ = run(sim, actions)
-        bounds = released_rewards.power_bounds_kw(sim.fleet, sim.sizing, sim.precision)
+        bounds = released.power_bounds_kw(sim.fleet, sim.sizing, sim.precision)
         low, high = (float(v[0]) for v in bounds)
     queued_at_night = 0
     for k, result in enumerate(results):

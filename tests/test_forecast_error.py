@@ -105,19 +105,6 @@ def test_agents_and_controllers_beside_them_see_the_same_errors() -> None:
     core.close()
 
 
-def test_restored_episode_continues_its_errors() -> None:
-    options = EnvOptions(agents=("agent_ls",), days=1, forecast_error=ERROR)
-    core = Core(configs(), options)
-    core.reset(1)
-    for _ in range(3):
-        core.step({"agent_ls": np.ones(2, dtype=np.int64)})
-    wanted, saved = core.view.forecast(12.0).ci_g_per_kwh, core.state_dict()
-    core.reset(2)
-    core.load_state_dict(saved)
-    np.testing.assert_array_equal(core.view.forecast(12.0).ci_g_per_kwh, wanted)
-    core.close()
-
-
 def test_view_of_an_earlier_step_says_that_it_is_too_old(sim: Simulator) -> None:
     sim.reset(0)
     look = view_maker(sim, ERROR)

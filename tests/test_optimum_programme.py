@@ -8,8 +8,7 @@ import pytest
 
 from model_steps import battery_step
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.optimum.battery_limits import battery_limits
-from sdc_taichi.optimum.dispatch import Dispatch
+from sdc_taichi.optimum.dispatch import Dispatch, battery_limits
 from sdc_taichi.optimum.linear_programme import bound, plan
 from sdc_taichi.optimum.paths import storage_parameters
 from sdc_taichi.optimum.problem import (

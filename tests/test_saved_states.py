@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,7 +22,6 @@ from sdc_taichi import (
     View,
     load_config,
 )
-from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.sim.snapshot import HALL_LIMITS_C
 
 CONFIG = load_config(
@@ -106,51 +106,22 @@ def equal_bits(one: Any, other: Any) -> bool:
     return bool(np.ascontiguousarray(one).tobytes() == np.ascontiguousarray(other).tobytes())
 
 
-DAMAGES: dict[str, tuple[tuple[str, ...], Any, str]] = {
-    "part": (("keys",), None, "parts are|keys"),
-    "kind": (("simulator",), [1.0], "simulator is a list"),
-    "options": (("options", "days"), 2, "made with days 2; valid is 1"),
-    "generators": (("generators",), [], "made by 0 environments; valid is 2"),
-    "generator": (("generators",), [{}, {}], "generator 0 is not valid"),
-    "keys": (("keys",), np.array([-1, 1]), "keys are"),
-    "commands": (("actions",), {"load": np.zeros(2)}, "actions are"),
-    "command shape": (("actions", "load"), np.zeros(3), "actions of load are float64"),
-    "command range": (("actions", "battery"), np.full(2, 9.0), "battery .* within -1..1"),
-    "command finite": (("actions", "load"), np.full(2, np.nan), "load .* within -1..1"),
-    "peaks": (("rewards",), np.full((2, 2), np.inf), "rewards are .* kW"),
-    "state type": (("simulator", "stored_kwh"), np.zeros(2, np.float32), "stored_kwh"),
-    "state range": (("simulator", "queue"), None, "queue"),
-}
-"""Path of an entry of a state, another value, and what the refusal says."""
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_states_are_refused_and_change_nothing(damage: str) -> None:
-    env, twin = MAKERS["vector_env"](), MAKERS["vector_env"]()
-    for one in (env, twin):
-        one.reset(seed=2)
-        play(one, STEPS)
-    state = env.state_dict()
-    (*outer, name), value, message = DAMAGES[damage]
-    where = state
-    for key in outer:
-        where = where[key]
-    if damage == "part":
-        del where[name]
-    else:
-        where[name] = where[name] - 1e9 if value is None else value
-    present = env.state_dict()
-    with pytest.raises(SdcError, match=message):
-        env.load_state_dict(state)
-    assert equal(env.state_dict(), present)
-    assert equal(play(env, 2), play(twin, 2))
+@pytest.mark.parametrize("kind", MAKERS)
+def test_every_kind_goes_on_from_what_was_saved(kind: str) -> None:
+    env, other = MAKERS[kind](), MAKERS[kind]()
+    env.reset(seed=2)
+    play(env, STEPS)
+    saved = pickle.loads(pickle.dumps(env.state_dict()))
+    expected = play(env, STEPS)
+    for _ in range(2):  # once more into one that is elsewhere
+        other.load_state_dict(saved)
+        assert equal(play(other, STEPS), expected)
 
 
 @pytest.mark.parametrize("kind", MAKERS)
 def test_a_damaged_state_leaves_what_was_not_reset_as_it_was(kind: str) -> None:
     env, other = MAKERS[kind](), MAKERS[kind]()
     other.reset(seed=7)
-    play(other, STEPS)
     state = other.state_dict()
     simulator = state if isinstance(env, Simulator) else state["simulator"]
     simulator["room_heat_kwh"] = simulator["room_heat_kwh"] * 0 - 1e12
@@ -158,25 +129,83 @@ def test_a_damaged_state_leaves_what_was_not_reset_as_it_was(kind: str) -> None:
         env.load_state_dict(state)
     with pytest.raises(RuntimeStateError, match="call reset"):
         play(env, 1)
-    fresh = MAKERS[kind]()
-    for one in (env, fresh):
-        one.reset(seed=3)
-    assert equal(play(env, 2), play(fresh, 2))
 
 
-def test_a_last_step_that_fails_changes_nothing() -> None:
-    """Values within their limits from which no step can be done."""
-    env, twin = (sdc_taichi.vector_env(2, CONFIG, **OPTIONS) for _ in range(2))
+DAMAGES: list[tuple[tuple[str, ...], Any, str]] = [
+    (("keys",), None, "KeyError: 'keys'"),
+    (("simulator",), [1.0], "valid is what state_dict"),
+    (("options",), None, "valid is what state_dict"),
+    (("options", "days"), 2, "made with days 2; valid is 1, as here"),
+    (("generators",), [], "made by 0 environments; valid is 2"),
+    (("generators",), [{}, {}], "valid is what state_dict"),
+    (("keys",), np.array([-1, 1]), r"keys are \[-1, 1\]; valid is within 0"),
+    (("keys",), np.array([1.5, 2.0]), "keys are float64"),
+    (("actions",), {"load": np.zeros(2)}, r"actions are \['load'\]; valid is a dict"),
+    (("actions", "load"), np.zeros(3), r"actions of load are float64 \(3,\)"),
+    (("actions", "battery"), np.full(2, 9.0), "battery .* within -1..1"),
+    (("actions", "load"), np.full(2, np.nan), "load .* within -1..1"),
+    (("rewards",), np.full((2, 2), np.inf), r"rewards are \[\[inf"),
+    (("simulator", "stored_kwh"), np.zeros(2, np.float32), "stored_kwh"),
+    (("simulator", "queue"), -1e9, "queue"),
+]
+"""Path of an entry of a state, another value (None: without it), and what the refusal says."""
+
+
+def test_damaged_states_are_refused_and_change_nothing() -> None:
+    env, twin = MAKERS["vector_env"](), MAKERS["vector_env"]()
     for one in (env, twin):
         one.reset(seed=2)
         play(one, STEPS)
-    state, present = env.state_dict(), env.state_dict()
+    for (*outer, name), value, message in DAMAGES:
+        state = env.state_dict()
+        where = state
+        for key in outer:
+            where = where[key]
+        if name == "queue":
+            where[name] = where[name] + value
+        elif name == "keys" and value is None:
+            del where[name]
+        else:
+            where[name] = value
+        with pytest.raises(SdcError, match=message):
+            env.load_state_dict(state)
+    assert equal(env.state_dict(), twin.state_dict())
+    assert equal(play(env, 2), play(twin, 2))
+
+
+def test_a_state_from_which_no_step_can_be_done_asks_for_a_reset() -> None:
+    env = sdc_taichi.vector_env(2, CONFIG, **OPTIONS)
+    env.reset(seed=2)
+    play(env, STEPS)
+    state = env.state_dict()
     for name in ("server_c", "mixed_c"):
         state["simulator"][name][:] = HALL_LIMITS_C[1]
-    with pytest.raises(SdcError, match=r"state: cannot be continued \(corrected: .* physical is"):
+    with pytest.raises(SdcError, match=r"corrected: .* physical is"):
         env.load_state_dict(state)
-    assert equal(env.state_dict(), present)
-    assert equal(play(env, STEPS), play(twin, STEPS))
+    with pytest.raises(RuntimeStateError, match="call reset"):
+        play(env, 1)
+    env.reset(seed=2)
+    play(env, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"config": "corrected"}, "another fleet"),
+        ({"agents": ["agent_bat"]}, "made with agents"),
+        ({"actions": "continuous"}, "made with actions 'discrete'"),
+        ({"forecast_error": ForecastError(0.1)}, "made with forecast_error"),
+        ({"rewards": {"agent_dc": {"pue": 1.0}}}, "made with rewards {"),
+        ({"rewards": lambda result, view: -result.grid_kwh}, "made with rewards {"),
+        ({"tariff": {"price_per_kwh": [0.1]}}, "made with tariff"),
+    ],
+)
+def test_saved_by_another_environment(options: dict[str, Any], message: str) -> None:
+    tiny: dict[str, Any] = {"config": "tiny", "days": 1}
+    env, other = sdc_taichi.parallel_env(**tiny), sdc_taichi.parallel_env(**{**tiny, **options})
+    env.reset(seed=0)
+    with pytest.raises(SdcError, match=message):
+        other.load_state_dict(env.state_dict())
 
 
 LIMITS: list[tuple[str, float, str]] = [
@@ -216,15 +245,3 @@ def test_an_episode_has_no_more_steps_than_it_has() -> None:
     play(long, 4)
     with pytest.raises(SdcError, match="state: 4 steps; valid is at most 3, the episode"):
         short.load_state_dict(long.state_dict())  # type: ignore[attr-defined]
-
-
-def test_agents_act_on_what_they_command() -> None:
-    """A command of an agent that does not act here, or none of one that does, is refused."""
-    env = sdc_taichi.parallel_env("tiny", days=1)
-    env.reset(seed=0)
-    env.step(dict.fromkeys(AGENTS, 1))
-    state = env.state_dict()
-    for missing in state["actions"]:
-        actions = {name: value for name, value in state["actions"].items() if name != missing}
-        with pytest.raises(SdcError, match="state: actions are"):
-            env.load_state_dict({**state, "actions": actions})

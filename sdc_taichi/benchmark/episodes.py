@@ -292,7 +292,7 @@ class FollowedOptimum:
     def act(self, view: View) -> Actions:
         """Commands for work, setpoint and battery."""
         if self._follower is None:
-            self._follower = Follower(view, self._targets(view))
+            self._follower = Follower(view.fleet, view.drivers, view.sizing, self._targets(view))
         return self._follower.actions(view.state)
 
     def _targets(self, view: View) -> Targets:

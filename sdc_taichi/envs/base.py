@@ -26,7 +26,7 @@ from sdc_taichi.envs.options import (
     configs_and_options,
     fields_set,
 )
-from sdc_taichi.envs.recording import RecorderOption, RecordingCore
+from sdc_taichi.envs.recording import RecorderOption
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
@@ -41,7 +41,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 class Environment:
     """Attributes and methods of all environments beyond Gymnasium and PettingZoo."""
 
-    core: RecordingCore
+    core: Core
     """The data centers."""
     render_mode: str | None
     """None or ``rgb_array``."""
@@ -83,7 +83,7 @@ class Environment:
         configs, chosen = configs_and_options(config, overrides, options, keywords, only_agent)
         if isinstance(self, SingleEnv) and len(configs) != 1:
             raise ConfigError(f"config: {len(configs)} data centers; valid is one, or vector_env")
-        self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
+        self.core = Core(configs, chosen, num_envs, precision, recorder)
         self.render_mode = render_mode
         self.state_space = self.core.state_space
 
@@ -229,7 +229,7 @@ def first_of_batch(observation: Observation) -> Observation:
 class HasSpec:
     """Spec of an environment that ``gymnasium.make`` or ``make_vec`` made."""
 
-    core: RecordingCore
+    core: Core
     """The data centers."""
     _spec: EnvSpec | None = None
 

@@ -33,7 +33,6 @@ from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.episodes import (
     Draw,
     DrawnInputs,
-    SavedState,
     Seed,
     check_state,
     chosen_start_days,
@@ -45,8 +44,9 @@ from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.images import heat_map, heat_map_space
 from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.recording import EpisodeRecordings, RecorderOption
 from sdc_taichi.envs.rewards import Rewards
-from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
+from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet_configs import MOST_DCS
@@ -86,6 +86,7 @@ class Core:
         options: actions, observations and rewards of the agents.
         num_envs: number of environments; None is one per config.
         precision: precision of the server kernels.
+        recorder: chosen episodes and destination of recordings; None records nothing.
 
     Attributes:
         options: the options.
@@ -108,6 +109,7 @@ class Core:
         options: EnvOptions,
         num_envs: int | None = None,
         precision: Precision = "f32",
+        recorder: RecorderOption = None,
     ) -> None:
         size = _checked_size(num_envs, len(configs))
         self.options = options
@@ -162,6 +164,8 @@ class Core:
         self._final_terms: dict[str, F64] = {}
         self._keys: I64 = np.zeros(size, dtype=np.int64)
         self._closed = False
+        self._recordings: EpisodeRecordings | None = None
+        self.record_episodes(recorder)
 
     def end_after(self, steps: int) -> None:
         """End episodes after fewer steps than their days have.
@@ -205,7 +209,7 @@ class Core:
         self.sim.reset(events, days * self._steps_per_day, inputs)
         self._begin()
         observations = self._observe(self.view)
-        self._on_begin()
+        self._begin_recording()
         return observations
 
     def next_episode(self) -> dict[str, Observation]:
@@ -232,8 +236,26 @@ class Core:
         self._observer.reset(view)
         self._rewards.reset(view)
 
-    def _on_begin(self) -> None:
-        """Hook after an episode has begun or has been continued from a saved state."""
+    def record_episodes(self, recorder: RecorderOption) -> None:
+        """Record chosen episodes, starting with the next.
+
+        Args:
+            recorder: chosen episodes and destination; None records nothing.
+
+        Raises:
+            RuntimeStateError: episodes are recorded already.
+            SdcError: a recorder that is not valid.
+        """
+        if recorder is None:
+            return
+        if self._recordings is not None:
+            raise RuntimeStateError("recorder: the episodes are recorded already; valid is one")
+        self._recordings = EpisodeRecordings(recorder, self.sim)
+
+    def _begin_recording(self) -> None:
+        """Begin the recording of an episode if it is chosen."""
+        if self._recordings is not None:
+            self._recordings.begin(self.sim)
 
     def step(self, actions: Mapping[str, Any]) -> Transition:
         """Advance all environments.
@@ -260,7 +282,7 @@ class Core:
         self._last = (view.state, commands)
         self._view = view = self._view_after(result)
         rewards, joint_reward = self._rewards.rewards(result, view)
-        return Transition(
+        transition = Transition(
             observations=self._observe(view),
             rewards=rewards,
             joint_reward=joint_reward,
@@ -268,6 +290,12 @@ class Core:
             ended=self.episode_over,
             result=result,
         )
+        if self._recordings is not None and self._recordings.is_recording:
+            terms = self._rewards.terms(result, self._rewards.used_terms)
+            self._recordings.add(result, {**rewards, **terms})
+            if transition.ended:
+                self._recordings.end()
+        return transition
 
     def actions_of(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
         """Actions for ``step`` that approximate commands most closely, by learning agent.
@@ -341,8 +369,8 @@ class Core:
             Observations before the next step.
 
         Raises:
-            SdcError: the state belongs to other environments, is incomplete or not valid; the
-                environments are unchanged.
+            SdcError: the state belongs to other environments, is incomplete or not valid, and the
+                environments are unchanged; or no step can be done from it, and they need ``reset``.
         """
         self._check_open()
         saved = check_state(
@@ -354,54 +382,28 @@ class Core:
             by_others=self._commands_of_others,
             steps=self.steps,
         )
-        before, terms = self._present(), self._final_terms
         try:
-            self._continue_from(saved)
-            observations = self._observe(self.view)
-            self._on_begin()
-        except BaseException as error:
-            self._continue_from(before)
-            self._final_terms = terms
-            if isinstance(error, SdcError):
-                raise SdcError(f"state: cannot be continued ({error})") from None
+            self.sim.continue_from(saved.simulator, saved.drivers)
+            self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
+            self._begin()
+            if saved.commands is not None:
+                # Repeat the last step, because its result is not part of the saved state.
+                self._last = (self.sim.state, saved.commands)
+                self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
+            self._rewards.load_peaks_kw(saved.peaks_kw)
+            self._begin_recording()
+        except BaseException:
+            self._view = None  # half of it is the state before
             raise
-        return observations
-
-    def _present(self) -> SavedState | None:
-        """Present state of the episodes; None before the first."""
-        if self._view is None:
-            return None
-        state, commands = self._last or (self._view.state, None)
-        return SavedState(
-            simulator=state,
-            drivers=self.sim.drivers,
-            draw=self._draw,
-            generators=self._generators,
-            keys=self._keys,
-            peaks_kw=self._rewards.peaks_kw(),
-            commands=commands,
-        )
-
-    def _continue_from(self, saved: SavedState | None) -> None:
-        """Continue from a state; None is the state before the first episode."""
-        if saved is None:
-            self.sim.continue_from(None)
-            self._generators, self._draw, self._view, self._last = [], None, None, None
-            return
-        self.sim.continue_from(saved.simulator, saved.drivers)
-        self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
-        self._begin()
-        if saved.commands is not None:
-            # Repeat the last step, because its result is not part of the saved state.
-            self._last = (self.sim.state, saved.commands)
-            self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
-        self._rewards.load_peaks_kw(saved.peaks_kw)
+        return self._observe(self.view)
 
     def close(self) -> None:
         """Release the simulator and all tables; the environments are unusable afterwards."""
         if self._closed:
             return
         self._closed = True
+        if self._recordings is not None:
+            self._recordings.end()
         self.sim.close()
         self._view = self._view_after = self._last = None
         self._final_terms = {}

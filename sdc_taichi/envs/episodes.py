@@ -161,30 +161,27 @@ class DrawnInputs:
             self._last = draw, self._reader.read(draw.years, draw.traces)
         return self._last[1]
 
-    def checked(self, given: Any, num_envs: int) -> Draw:
+    def checked(self, given: Mapping[str, Any], num_envs: int) -> Draw:
         """The draw that a saved state names.
 
         Raises:
             SdcError: a draw that these options cannot give.
         """
-        names = {"years", "traces"}
-        if not isinstance(given, Mapping) or set(given) != names:
-            raise SdcError("state: inputs are not valid; valid is what state_dict() gave")
         years, traces = given["years"], given["traces"]
+        valid_years = range(self._years) if isinstance(self._years, int) else self._years
         for name, values, valid in (
-            ("years", years, range(self._years) if isinstance(self._years, int) else self._years),
+            ("years", years, valid_years),
             ("traces", traces, self._traces),
         ):
             if valid is None or values is None:
-                good = valid is values
+                can_be_drawn = valid is values
             else:
-                listed = isinstance(values, list | tuple) and len(values) == num_envs
-                good = listed and all(type(x) is type(valid[0]) and x in valid for x in values)
-            if not good:
+                can_be_drawn = len(values) == num_envs and all(x in valid for x in values)
+            if not can_be_drawn:
                 raise SdcError(
                     f"state: {name} {shortened(values)}: not drawn by these environments"
                 )
-        return Draw(None if years is None else tuple(years), traces and tuple(traces))
+        return Draw(years and tuple(years), traces and tuple(traces))
 
 
 def draws_inputs(options: EnvOptions) -> bool:
@@ -212,8 +209,6 @@ COMMAND_LIMITS = {
     "battery": (-1.0, 1.0),
 }
 """Lowest and highest command that an agent or a controller can give, by field of ``Actions``."""
-_MAY_BE_NONE = frozenset({"cooling", "placement"})
-"""Fields of ``Actions`` that a controller may leave at None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,147 +245,112 @@ def check_state(
     """Check a state against the environments that will continue from it.
 
     Args:
-        values: what ``state_dict`` gave.
-        options: plain values that tell the environments apart.
-        inputs: what draws their years and traces; None if nothing does.
+        values: what ``state_dict`` returned.
+        options: plain values that identify the environments.
+        inputs: source of their years and traces; None if they draw none.
         sim: their simulator.
-        learned: names of the commands that agents learn, which each of their steps has.
+        learned: names of the commands of learning agents, which every step has.
         by_others: names of the commands that ``others`` may give.
         steps: number of steps of an episode.
 
     Raises:
         SdcError: made by other environments, incomplete, or not valid.
     """
-    _check_parts(values, sim.size)
-    _check_options(values["options"], options)
-    draw = drivers = None
-    if inputs is not None:
-        draw = inputs.checked(values["inputs"], sim.size)
-        drivers = inputs.drivers(draw)
-    elif values["inputs"] is not None:
-        raise SdcError("state: inputs were drawn; valid is None, as these environments draw none")
-    state = sim.read_state(values["simulator"], drivers)
-    given = _checked_commands(values["actions"], learned, by_others, sim.fleet)
-    if given is None and state.step > 0:
-        raise SdcError(f"state: no actions after {state.step} steps; valid is before the first")
-    done = state.step + (given is not None)
+    try:
+        parts = {name: values[name] for name in PARTS}
+        _check_options(parts["options"], options)
+        if len(parts["generators"]) != sim.size:
+            raise SdcError(
+                f"state: made by {len(parts['generators'])} environments; valid is {sim.size}"
+            )
+        draw = drivers = None
+        if inputs is not None:
+            draw = inputs.checked(parts["inputs"], sim.size)
+            drivers = inputs.drivers(draw)
+        saved = SavedState(
+            simulator=sim.read_state(parts["simulator"], drivers),
+            drivers=drivers,
+            draw=draw,
+            generators=[_generator(state) for state in parts["generators"]],
+            keys=_checked("keys", parts["keys"], np.int64, [(sim.size,)], 0, 2**63 - 1),
+            peaks_kw=_checked(
+                "rewards", parts["rewards"], np.float64, [(2, sim.size)], 0, MAX_PEAK_KW
+            ),
+            commands=_checked_commands(parts["actions"], learned, by_others, sim.fleet),
+        )
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise SdcError(
+            f"state: {type(error).__name__}: {error}; valid is what state_dict() returned"
+        ) from None
+    done = saved.simulator.step + (saved.commands is not None)
     if done > steps:
         raise SdcError(f"state: {done} steps; valid is at most {steps}, the episode")
-    steps_per_day = 24 * sim.fleet.steps_per_hour
-    first_days, rest = np.divmod(state.start, steps_per_day)
-    if np.any(rest) or np.any(first_days >= DAYS_PER_YEAR):
-        raise SdcError(
-            f"state: simulator starts in step {shortened(state.start.tolist())} of the year; "
-            f"valid is midnight, a multiple of {steps_per_day}, of one of {DAYS_PER_YEAR} days"
-        )
-    keys = as_array("state: keys", values["keys"])
-    if keys.shape != (sim.size,) or keys.dtype != np.int64 or keys.min() < 0:
-        raise SdcError(f"state: keys are {keys.dtype} {keys.shape}; valid is int64 from 0 on")
-    return SavedState(
-        simulator=state,
-        drivers=drivers,
-        draw=draw,
-        generators=[_checked_generator(x, i) for i, x in enumerate(values["generators"])],
-        keys=keys.copy(),
-        peaks_kw=_checked_peaks_kw(values["rewards"], sim.size),
-        commands=given,
-    )
-
-
-def _check_parts(values: Any, num_envs: int) -> None:
-    """Refuse a state whose parts are missing, unknown or of another type."""
-    if not isinstance(values, Mapping):
-        raise SdcError(f"state: is a {type(values).__name__}; valid is what state_dict() gave")
-    if set(values) != set(PARTS):
-        raise SdcError(
-            f"state: parts are {shortened(sorted(map(str, values)))}; valid is {sorted(PARTS)}"
-        )
-    for name, kind in (("options", Mapping), ("simulator", Mapping), ("generators", list)):
-        if not isinstance(values[name], kind):
-            raise SdcError(f"state: {name} is a {type(values[name]).__name__}")
-    made_by = len(values["generators"])
-    if made_by != num_envs:
-        raise SdcError(f"state: made by {made_by} environments; valid is {num_envs}")
+    return saved
 
 
 def _check_options(made: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
     """Refuse a state that was made with other options."""
     for name, value in mine.items():
-        if name not in made or not _is_equal(made[name], value):
+        if name not in made or made[name] != value:
             raise SdcError(
                 f"state: made with {name} {shortened(made.get(name))}; valid is "
                 f"{shortened(value)}, as here"
             )
 
 
-def _is_equal(one: Any, other: Any) -> bool:
-    """Whether two option values are equal; text equals text alone."""
-    try:
-        return bool(one == other)
-    except ValueError:  # arrays
-        return False
-
-
-def _checked_generator(state: Any, index: int) -> np.random.Generator:
-    """The generator of an environment in the state that NumPy gave."""
+def _generator(state: Any) -> np.random.Generator:
+    """The generator of an environment in a state that NumPy returned."""
     rng = np.random.Generator(np.random.PCG64(0))
-    try:
-        rng.bit_generator.state = state
-    except (TypeError, ValueError, KeyError, OverflowError):
-        raise SdcError(
-            f"state: generator {index} is not valid ({shortened(state)}); valid is the state of a "
-            "PCG64 of NumPy"
-        ) from None
+    rng.bit_generator.state = state
     return rng
 
 
-def _checked_peaks_kw(given: Any, num_envs: int) -> F64:
-    """Highest billed power before the last step and with it, in kW, (2, B)."""
-    peaks_kw = as_array("state: rewards", given)
-    if peaks_kw.shape != (2, num_envs) or peaks_kw.dtype != np.float64:
-        raise SdcError(
-            f"state: rewards are {peaks_kw.dtype} {peaks_kw.shape}; valid is float64 (2, "
-            f"{num_envs})"
-        )
-    if not np.all((peaks_kw >= 0.0) & (peaks_kw <= MAX_PEAK_KW)):
-        raise SdcError(
-            f"state: rewards are {shortened(peaks_kw.tolist())}; valid is powers of "
-            f"0..{MAX_PEAK_KW:g} kW"
-        )
-    return peaks_kw.copy()
-
-
 def _checked_commands(
-    given: Any, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
+    given: Mapping[str, Any] | None, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
 ) -> dict[str, F64] | None:
-    """Commands of the last step, (), (B,), (U,) or (R,) each; None before the first step."""
+    """Commands of the last step, (), (B,), (U,) or (R,) each; None before the first step.
+
+    A controller may leave commands of CRAC units and racks at None.
+    """
     if given is None:
         return None
     names = [*learned, *by_others]
-    optional = _MAY_BE_NONE.intersection(by_others)
-    if not isinstance(given, Mapping) or not set(names) - optional <= set(given) <= set(names):
-        found = sorted(map(str, given)) if isinstance(given, Mapping) else given
+    optional = {"cooling", "placement"}.intersection(by_others)
+    if not set(names) - optional <= set(given) <= set(names):
         raise SdcError(
-            f"state: actions are {shortened(found)}; valid is a dict of {sorted(names)}, or None "
-            "before the first step"
+            f"state: actions are {shortened(sorted(given))}; valid is a dict of {sorted(names)}"
         )
-    return {name: _checked_command(name, given[name], fleet) for name in names if name in given}
-
-
-def _checked_command(name: str, given: Any, fleet: Fleet) -> F64:
-    """A command of the last step."""
-    values = as_array(f"state: actions of {name}", given)
     of_parts = {"cooling": fleet.units, "fan": fleet.units, "placement": fleet.racks}
-    shapes = [(), (fleet.size,)] + ([(of_parts[name],)] if name in of_parts else [])
-    if values.shape not in shapes or values.dtype != np.float64:
-        raise SdcError(
-            f"state: actions of {name} are {values.dtype} {values.shape}; valid is float64 of "
-            f"{' or '.join(map(str, shapes))}"
+    return {
+        name: _checked(
+            f"actions of {name}",
+            given[name],
+            np.float64,
+            [(), (fleet.size,), (of_parts.get(name, fleet.size),)],
+            *COMMAND_LIMITS[name],
         )
-    low, high = COMMAND_LIMITS[name]
-    if not np.all((values >= low) & (values <= high)):
+        for name in names
+        if name in given
+    }
+
+
+def _checked(
+    name: str,
+    given: Any,
+    dtype: type[np.generic],
+    shapes: Sequence[tuple[int, ...]],
+    low: float,
+    high: float,
+) -> Any:
+    """Copy of an array of a state, which must have a type, one of some shapes, and a range."""
+    array = as_array(f"state: {name}", given)
+    if array.shape not in shapes or array.dtype != dtype:
         raise SdcError(
-            f"state: actions of {name} are {shortened(values.tolist())}; valid is within "
-            f"{low:g}..{high:g}"
+            f"state: {name} are {array.dtype} {array.shape}; valid is {dtype.__name__} of "
+            f"{' or '.join(map(str, dict.fromkeys(shapes)))}"
         )
-    return values.copy()
+    if not np.all((array >= low) & (array <= high)):
+        raise SdcError(
+            f"state: {name} are {shortened(array.tolist())}; valid is within {low:g}..{high:g}"
+        )
+    return array.copy()

@@ -2,9 +2,9 @@
 
 Option ``recorder`` of all environments takes an ``EpisodeRecorder``, the choice of episodes and
 their destination; wrapper ``RecordEpisodes`` does the same for vector environments. A ``Recorder``
-(sdc_taichi.viz.recorder) writes each episode. ``RecordingCore`` passes it every step of the batch,
-so recordings do not depend on the interface of the environment, and results do not depend on
-whether they are recorded.
+(sdc_taichi.viz.recorder) writes each episode. ``Core`` passes it every step of the batch, so
+recordings do not depend on the interface of the environment, and results do not depend on whether
+they are recorded.
 """
 
 from __future__ import annotations
@@ -20,23 +20,13 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from gymnasium.vector import VectorEnv, VectorWrapper
-
-from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.envs.core import Core, Transition
-from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.viz.recording_output import RecordingWarning, check_path, is_address
 
 if TYPE_CHECKING:
     from sdc_taichi.viz.recorder import Recorder
-
-    _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any]
-else:
-    _VectorWrapper = VectorWrapper  # Gymnasium 1.4 is the first in which it takes parameters.
 
 
 def capped_cubic_schedule(episode: int) -> bool:
@@ -73,123 +63,21 @@ RecorderOption: TypeAlias = "str | os.PathLike[str] | Recorder | EpisodeRecorder
 """Argument ``recorder`` of environments: an ``EpisodeRecorder``, or the target of one."""
 
 
-class RecordingCore(Core):
-    """A batch of data centers whose episodes can be recorded; without a recorder, ``Core``.
-
-    Args:
-        configs: configs of data centers; environment i takes config i modulo their number.
-        options: actions, observations and rewards of the agents.
-        num_envs: number of environments; None is one per config.
-        precision: number type of the server kernels.
-        recorder: chosen episodes and destination; None records nothing.
-
-    Raises:
-        SdcError: an argument that is not valid.
-    """
-
-    _recordings: _EpisodeRecordings | None = None
-
-    def __init__(
-        self,
-        configs: Sequence[DataCenterConfig],
-        options: EnvOptions,
-        num_envs: int | None = None,
-        precision: Precision = "f32",
-        recorder: RecorderOption = None,
-    ) -> None:
-        super().__init__(configs, options, num_envs, precision)
-        if recorder is not None:
-            self.record_episodes(recorder)
-
-    def record_episodes(
-        self, recorder: str | os.PathLike[str] | Recorder | EpisodeRecorder
-    ) -> None:
-        """Record chosen episodes, starting with the next.
-
-        Args:
-            recorder: chosen episodes and destination.
-
-        Raises:
-            RuntimeStateError: episodes are recorded already.
-            SdcError: a recorder that is not valid.
-        """
-        if self._recordings is not None:
-            raise RuntimeStateError("recorder: the episodes are recorded already; valid is one")
-        if not isinstance(recorder, EpisodeRecorder):
-            recorder = EpisodeRecorder(recorder)
-        self._recordings = _EpisodeRecordings(recorder, self.sim)
-
-    def _on_begin(self) -> None:
-        """Begin the recording of an episode if it is chosen."""
-        if self._recordings is not None:
-            self._recordings.begin(self.sim)
-
-    def step(self, actions: Mapping[str, Any]) -> Transition:
-        """Advance all environments as ``Core.step`` does, and record the step."""
-        transition = super().step(actions)
-        if self._recordings is not None and self._recordings.is_recording:
-            terms = self._rewards.terms(transition.result, self._rewards.used_terms)
-            self._recordings.add(transition.result, {**transition.rewards, **terms})
-            if transition.ended:
-                self._recordings.end()
-        return transition
-
-    def close(self) -> None:
-        """End the recording and release the simulator."""
-        if self._recordings is not None:
-            self._recordings.end()
-        super().close()
-
-
-class RecordEpisodes(_VectorWrapper):
-    """Wrapper that records a vector environment of ``gymnasium.make_vec("sdc_taichi/...")``.
-
-    ``RecordEpisodes(env, target, ...)`` does the same as ``make_vec`` with
-    ``recorder=EpisodeRecorder(target, ...)``. Closing the environment ends the recording.
-
-    Args:
-        env: a batch of ``gymnasium.make_vec``, wrapped or not.
-        target: destination, as ``EpisodeRecorder.target``.
-        episode_trigger: choice of episodes, as ``EpisodeRecorder.episode_trigger``.
-        envs: choice of environments, as ``EpisodeRecorder.envs``.
-        every: steps between two heat maps, and between two frames of the 3D hall.
-
-    Raises:
-        SdcError: an environment of another kind, or an argument that is not valid.
-    """
-
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        target: str | os.PathLike[str] | Recorder,
-        *,
-        episode_trigger: Callable[[int], bool] | None = None,
-        envs: Sequence[int] | None = None,
-        every: int | None = None,
-    ) -> None:
-        core = getattr(getattr(env, "unwrapped", None), "core", None)
-        if not (isinstance(env, VectorEnv) and isinstance(core, RecordingCore)):
-            raise ConfigError(
-                f"env: {type(getattr(env, 'unwrapped', env)).__name__} cannot be recorded here; "
-                "valid is a batch of gymnasium.make_vec('sdc_taichi/...') that is one environment "
-                "of its own; others take recorder=... when they are made"
-            )
-        super().__init__(env)
-        core.record_episodes(EpisodeRecorder(target, episode_trigger, envs, every))
-
-
-class _EpisodeRecordings:
+class EpisodeRecordings:
     """Successive recordings of a batch's episodes.
 
     Args:
-        settings: chosen episodes and destination.
+        recorder: chosen episodes and destination, or a destination.
         sim: the simulator of the batch.
 
     Raises:
-        SdcError: settings that are not valid.
+        SdcError: a recorder that is not valid.
     """
 
-    def __init__(self, settings: EpisodeRecorder, sim: Simulator) -> None:
+    def __init__(
+        self, recorder: str | os.PathLike[str] | Recorder | EpisodeRecorder, sim: Simulator
+    ) -> None:
+        settings = recorder if isinstance(recorder, EpisodeRecorder) else EpisodeRecorder(recorder)
         _check(settings, sim.size)
         self._settings = settings
         self._trigger = settings.episode_trigger or capped_cubic_schedule
@@ -295,19 +183,14 @@ class _EpisodeRecordings:
         return Recorder(target, focus=[names[i] for i in envs], every=every)
 
 
-_recordings_by_place: weakref.WeakValueDictionary[Path | Recorder | None, _EpisodeRecordings] = (
+_recordings_by_place: weakref.WeakValueDictionary[Path | Recorder | None, EpisodeRecordings] = (
     weakref.WeakValueDictionary()
 )
 """Recordings in progress in this process, by file or given recorder."""
 
 
 def _check(settings: EpisodeRecorder, size: int) -> None:
-    """Check settings before the first episode.
-
-    Args:
-        settings: chosen episodes and destination.
-        size: number of environments.
-    """
+    """Check settings of a batch of ``size`` environments before the first episode."""
     from sdc_taichi.viz.recorder import MAX_FOCUS, Recorder
 
     target, envs, trigger = settings.target, settings.envs, settings.episode_trigger

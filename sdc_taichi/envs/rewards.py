@@ -16,7 +16,7 @@ import numpy as np
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.features import NotedReads
-from sdc_taichi.envs.released_rewards import ReleasedRewards
+from sdc_taichi.envs.released import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, RewardContext, TermContext
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -22,33 +22,10 @@ from sdc_taichi.envs.base import (
     step_info,
 )
 from sdc_taichi.envs.core import Core, Observation, Transition
-from sdc_taichi.envs.features import Feature, entries_of_new_features
+from sdc_taichi.envs.features import entries_of_new_features
 from sdc_taichi.envs.options import ConfigSource
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F32, F64
-
-
-class Learner(Protocol):
-    """Conversion between the single learner of a batch and its agents; environments come first."""
-
-    observation_space: spaces.Space[Any]
-    """Space of the learner's observation in one environment."""
-    action_space: spaces.Space[Any]
-    """Space of the learner's action in one environment."""
-    features: tuple[Feature, ...]
-    """Features of the learner's observation, in order."""
-
-    def actions(self, given: Any) -> dict[str, Any]:
-        """Actions of each agent from those of the learner, (B,) or (B, k)."""
-
-    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """Actions of the learner from those of the agents, (B,) or (B, k)."""
-
-    def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
-        """Observations of the learner from those of the agents, (B, n)."""
-
-    def reward(self, transition: Transition) -> F64:
-        """Reward of the learner, (B,)."""
 
 
 class AgentLearner:
@@ -65,8 +42,8 @@ class AgentLearner:
 
     def __init__(self, core: Core) -> None:
         (self._agent,) = core.agents
-        self.observation_space = core.observation_spaces[self._agent]
-        self.action_space = core.action_spaces[self._agent]
+        self.observation_space: spaces.Space[Any] = core.observation_spaces[self._agent]
+        self.action_space: spaces.Space[Any] = core.action_spaces[self._agent]
         self.features = core.features[self._agent]
 
     def actions(self, given: Any) -> dict[str, Any]:
@@ -152,6 +129,10 @@ class JointLearner:
     def reward(self, transition: Transition) -> F64:
         """The reward of all agents together, (B,)."""
         return np.array(transition.joint_reward)
+
+
+Learner: TypeAlias = AgentLearner | JointLearner
+"""Conversion between the single learner of a batch and its agents; environments come first."""
 
 
 def make_learner(core: Core, agent: str | None) -> Learner:

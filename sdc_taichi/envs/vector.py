@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Self
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs.base import (
@@ -19,13 +20,21 @@ from sdc_taichi.envs.base import (
     start_day_option,
     step_info,
 )
-from sdc_taichi.envs.core import Observation
+from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episodes import Seed
 from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.options import ConfigSource
+from sdc_taichi.envs.recording import EpisodeRecorder
 from sdc_taichi.envs.single import learning_agent, make_learner
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F32, F64, Actions
+
+if TYPE_CHECKING:
+    from sdc_taichi.viz.recorder import Recorder
+
+    _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any]
+else:
+    _VectorWrapper = VectorWrapper  # Gymnasium 1.4 is the first in which it takes parameters.
 
 Flags = npt.NDArray[np.bool_]
 
@@ -175,6 +184,43 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         if not self.closed:
             super().close()
             self.closed = True
+
+
+class RecordEpisodes(_VectorWrapper):
+    """Wrapper that records a vector environment of ``gymnasium.make_vec("sdc_taichi/...")``.
+
+    ``RecordEpisodes(env, target, ...)`` does the same as ``make_vec`` with
+    ``recorder=EpisodeRecorder(target, ...)``. Closing the environment ends the recording.
+
+    Args:
+        env: a batch of ``gymnasium.make_vec``, wrapped or not.
+        target: destination, as ``EpisodeRecorder.target``.
+        episode_trigger: choice of episodes, as ``EpisodeRecorder.episode_trigger``.
+        envs: choice of environments, as ``EpisodeRecorder.envs``.
+        every: steps between two heat maps, and between two frames of the 3D hall.
+
+    Raises:
+        SdcError: an environment of another kind, or an argument that is not valid.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        target: str | os.PathLike[str] | Recorder,
+        *,
+        episode_trigger: Callable[[int], bool] | None = None,
+        envs: Sequence[int] | None = None,
+        every: int | None = None,
+    ) -> None:
+        core = getattr(getattr(env, "unwrapped", None), "core", None)
+        if not (isinstance(env, VectorEnv) and isinstance(core, Core)):
+            raise ConfigError(
+                f"env: {type(getattr(env, 'unwrapped', env)).__name__} cannot be recorded here; "
+                "valid is a batch of gymnasium.make_vec('sdc_taichi/...') that is one environment "
+                "of its own; others take recorder=... when they are made"
+            )
+        super().__init__(env)
+        core.record_episodes(EpisodeRecorder(target, episode_trigger, envs, every))
 
 
 class MultiAgentVectorEnv(BatchEnv, AgentSpaces):

@@ -195,7 +195,7 @@ def facility_map(
     for part in batches(fleet, nodes):
         own = slice(len(tables), len(tables) + len(part))
         at = weather.outdoor_c[own], weather.wet_bulb_c[own]
-        tables += tabulate(fleet, drivers, part, *at, precision) or ()
+        tables += tabulate(fleet, drivers, part, *at, precision)
     shape = len(dcs), *weather.shape, utilisations, setpoints
     return FacilityMap(
         which=which,

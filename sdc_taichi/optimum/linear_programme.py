@@ -9,7 +9,7 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.dispatch import DEFER, DRAIN, DUE, Dispatch, DispatchProgramme, Span
-from sdc_taichi.optimum.problem import Ends, Problem, StoppedError
+from sdc_taichi.optimum.problem import Ends, Problem
 from sdc_taichi.optimum.programme import InfeasibleError
 from sdc_taichi.optimum.stage_cost import (
     LoadCurves,
@@ -41,7 +41,7 @@ _NEGLIGIBLE_TASKS = 1e-7
 
 
 def bound(
-    problem: Problem, ends: Ends | None = None, *, stop: Callable[[], bool] | None = None
+    problem: Problem, ends: Ends | None = None, *, check: Callable[[], None] = lambda: None
 ) -> Dispatch:
     """Find a figure of the scored steps below which no controller can come.
 
@@ -53,21 +53,20 @@ def bound(
         ends: State at the first scored step and at the end; the result then has scored steps
             alone. By default the state before the first step is that of the problem, and the end
             keeps at least the stored energy and at most the queue of the first scored step.
-        stop: Returns whether to end the work; called before every window.
+        check: Called before every window; an error that it raises ends the work.
 
     Returns:
         What reaches the bound, with prices of states; no queue may be able to do it.
 
     Raises:
         ConfigError: no plan keeps the limits.
-        StoppedError: ``stop`` was true.
     """
     stage = stage_cost(problem)
     curves = _curves(problem, stage)
     span = _span(problem, ends)
 
     def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
-        _ask(stop)
+        check()
         known = curves if cost is stage else _curves(part, cost)
         return _solve(part, DispatchProgramme(part, cost, known, of))
 
@@ -77,7 +76,7 @@ def bound(
     return bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
 
 
-def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatch:
+def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispatch:
     """Find a plan of low cost that a first-in-first-out queue and the battery can carry out.
 
     In each step of the plan work only enters the queue, or only leaves it, or exactly the due work
@@ -87,11 +86,10 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatc
 
     Args:
         problem: What is to be planned.
-        stop: Returns whether to end the work; called before every window.
+        check: Called before every window; an error that it raises ends the work.
 
     Raises:
         ConfigError: no plan keeps the limits.
-        StoppedError: ``stop`` was true.
     """
     stage = stage_cost(problem, warm_up_share=_WARM_UP_SHARE)
     curves = _curves(problem, stage)
@@ -101,7 +99,7 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatc
         span = replace(span, deferred_before=np.zeros(problem.work.deadline_steps))
 
     def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
-        _ask(stop)
+        check()
         return _plan_of_span(part, cost, curves, of)
 
     in_one = "load" not in problem.agents or problem.work.deadline_steps is None
@@ -112,7 +110,11 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatc
     if problem.steps <= longest + ahead:
         return solve(weighed, stage, span)
     if span.as_after is not None or problem.months:
-        span = _with_prices(weighed, span, stop)
+        relaxed = bound(weighed, check=check)
+        span = replace(span, least_peaks_kw=relaxed.peaks_kw)
+        if span.as_after is not None:
+            prices = (span.as_after, -relaxed.end_task_price, relaxed.end_kwh_price)
+            span = replace(span, state_values=(prices,))
     borders = window_ends(problem, 0, longest)
     return plan_in_windows(weighed, stage, span, borders, ahead, solve)
 
@@ -125,26 +127,6 @@ def _curves(problem: Problem, stage: StageCost) -> LoadCurves:
 def _ahead(problem: Problem, least: int) -> int:
     """Steps over which the state at one step matters to another: those of two deadlines."""
     return max(least, 2 * (problem.work.deadline_steps or 0))
-
-
-def _ask(stop: Callable[[], bool] | None) -> None:
-    """Go on unless the work is to end.
-
-    Raises:
-        StoppedError: ``stop`` was true.
-    """
-    if stop is not None and stop():
-        raise StoppedError("linear programmes were stopped")
-
-
-def _with_prices(problem: Problem, span: Span, stop: Callable[[], bool] | None) -> Span:
-    """A span with the peaks of its bound, and prices of the state that its end has to keep."""
-    relaxed = bound(problem, stop=stop)
-    span = replace(span, least_peaks_kw=relaxed.peaks_kw)
-    if span.as_after is None:
-        return span
-    held = (span.as_after, -relaxed.end_task_price, relaxed.end_kwh_price)
-    return replace(span, state_values=(held,))
 
 
 def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Dispatch:

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sdc_taichi.optimum.commands import battery_command, bus_energy_kwh
 from sdc_taichi.optimum.linear_programme import plan
 from sdc_taichi.optimum.problem import Agent, Problem, Storage
-from sdc_taichi.optimum.rollout import Targets
+from sdc_taichi.optimum.rollout import Targets, battery_command, bus_energy_kwh
 from sdc_taichi.optimum.tables import (
     INLET_MARGIN_K,
     FacilityTable,
@@ -55,7 +54,7 @@ def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
 
 
 def path_of(
-    problem: Problem, agents: tuple[Agent, ...], stop: Callable[[], bool] | None = None
+    problem: Problem, agents: tuple[Agent, ...], check: Callable[[], None] = lambda: None
 ) -> Targets:
     """A good path that moves some agents and leaves the others idle.
 
@@ -65,15 +64,14 @@ def path_of(
     Args:
         problem: The planning problem.
         agents: What the path may move.
-        stop: Returns whether to end the work.
+        check: Called before every linear programme; an error that it raises ends the work.
 
     Raises:
         ConfigError: No plan keeps the limits.
-        StoppedError: ``stop`` was true.
     """
     executed = problem.work.idle_tasks
     if "load" in agents:
-        executed = plan(replace(problem, agents=agents), stop=stop).executed_tasks
+        executed = plan(replace(problem, agents=agents), check=check).executed_tasks
     return _path(problem, agents, executed)
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import allowable_c
-from sdc_taichi.optimum.commands import arrived_tasks
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.plant.battery import BatteryParameters
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
-from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
+from sdc_taichi.plant.workload import MODELS as WORK_MODELS
+from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS, WorkPoint
 from sdc_taichi.sim.bills import month_around
 from sdc_taichi.sim.crac_units import schedules_c
 from sdc_taichi.sim.drivers import Drivers
@@ -291,6 +291,29 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
             )
         )
     return found
+
+
+def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
+    """Work that arrives as a model of work counts it, in tasks.
+
+    Args:
+        model: name of the model of work.
+        demand: work that arrives, as a share of capacity, 0..1.
+        flexible_share: share of it that may wait, 0..1.
+    """
+    nothing = np.zeros(np.shape(demand))
+    work = WORK_MODELS[model].step(
+        WorkPoint(
+            demand,
+            nothing,
+            nothing,
+            nothing,
+            flexible_share=flexible_share,
+            max_utilisation=1.0,
+            queue_limit=0.0,
+        )
+    )
+    return np.asarray(work.arrived_tasks)
 
 
 def _under_idle_commands(fleet: Fleet, demand: F64) -> tuple[F64, F64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -100,9 +100,9 @@ class Optimum:
         return value
 
 
-_KWH_SHARES = (0.0, 0.35, 0.65, 0.95)
+_KWH_SHARES = np.array([0.0, 0.35, 0.65, 0.95])
 """Energy stored at the nodes of a curve, as a share of capacity; it may never be full."""
-_TASK_SHARES = (0.0, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 13 / 16)
+_TASK_SHARES = np.array([0, 1, 2, 3, 4, 6, 8, 13]) / 16.0
 """Work that waits at the nodes of a curve, as a share of the longest queue. The first hours of it
 cost most, and the longest queue may be unreachable."""
 
@@ -143,7 +143,7 @@ class BoundOfEnds:
         """Planning problem of a data center; that of the last call is kept."""
         if self._problem is None or self._problem[0] != dc:
             part = self._task.part([dc])
-            self._problem = dc, part.problems(part.tables())[0]
+            self._problem = dc, part.problems()[0]
         return self._problem[1]
 
 
@@ -173,7 +173,7 @@ def with_tabled_ends(
         optimum: Optimum of the simulator's data centers.
         sim: The simulator.
         progress: Progress callback ``(stage, done, total)`` in data centers.
-        stop: Returns whether to end the work; called before each bound.
+        stop: Returns whether to end the work; called before each data center.
 
     Returns:
         The optimum; the one given where a queue has no limit.
@@ -184,45 +184,33 @@ def with_tabled_ends(
     limits = queue_limit_tasks(sim.fleet)
     if np.any(limits >= UNLIMITED_TASKS):
         return optimum
-    none = np.zeros(sim.size)
     full_kwh = sim.sizing.battery_kwh * sim.fleet.values("battery.upper_v")
-    most_kwh = full_kwh if "battery" in optimum.agents else none
-    most_tasks = limits if "load" in optimum.agents else none
     curves = []
     for dc in range(sim.size):
+        if stop is not None and stop():
+            raise StoppedError("values of ends were stopped")
         if progress is not None:
             progress("values of ends", dc, sim.size)
-        curves.append(_Curves(optimum, dc, float(most_kwh[dc]), float(most_tasks[dc]), stop))
-    return replace(optimum, bound_of_ends=lambda dc, ends: curves[dc].figure(ends))
+        most_kwh = float(full_kwh[dc]) if "battery" in optimum.agents else 0.0
+        most_tasks = float(limits[dc]) if "load" in optimum.agents else 0.0
+        curves.append(_ends_curve(partial(optimum.bound_of_ends, dc), most_kwh, most_tasks))
+    return replace(optimum, bound_of_ends=lambda dc, ends: curves[dc](ends))
 
 
-class _Curves:
-    """Bound of a data center by what is stored and by what waits at the end."""
+def _ends_curve(
+    bound_of: Callable[[Ends], float], most_kwh: float, most_tasks: float
+) -> Callable[[Ends], float]:
+    """Approximate bound of a data center by what is stored and by what waits at the end."""
+    kwh, tasks = np.unique(most_kwh * _KWH_SHARES), np.unique(most_tasks * _TASK_SHARES)
 
-    def __init__(
-        self,
-        optimum: Optimum,
-        dc: int,
-        most_kwh: float,
-        most_tasks: float,
-        stop: Callable[[], bool] | None,
-    ) -> None:
-        self._kwh = np.unique(np.multiply(most_kwh, _KWH_SHARES))
-        self._tasks = np.unique(np.multiply(most_tasks, _TASK_SHARES))
+    def exact(end_kwh: float, end_tasks: float) -> float:
+        return bound_of(Ends(most_kwh / 2, 0.0, float(end_kwh), float(end_tasks)))
 
-        def figure(kwh: float, tasks: float) -> float:
-            if stop is not None and stop():
-                raise StoppedError("values of ends were stopped")
-            return optimum.bound_of_ends(dc, Ends(most_kwh / 2, 0.0, float(kwh), float(tasks)))
-
-        self._of_kwh = np.array([figure(kwh, 0.0) for kwh in self._kwh])
-        self._of_tasks = np.array(
-            [self._of_kwh[0], *(figure(0.0, tasks) for tasks in self._tasks[1:])]
-        )
-
-    def figure(self, ends: Ends) -> float:
-        of_kwh = _line(ends.end_kwh, self._kwh, self._of_kwh)
-        return of_kwh + _line(ends.end_tasks, self._tasks, self._of_tasks) - float(self._of_kwh[0])
+    of_kwh = np.array([exact(x, 0.0) for x in kwh])
+    of_tasks = np.array([of_kwh[0], *(exact(0.0, x) for x in tasks[1:])])
+    return lambda ends: (
+        _line(ends.end_kwh, kwh, of_kwh) + _line(ends.end_tasks, tasks, of_tasks) - float(of_kwh[0])
+    )
 
 
 def _line(x: float, nodes: F64, values: F64) -> float:

@@ -1,41 +1,31 @@
-"""Plans run by the simulator itself, what that comes to, and whether it keeps the constraints."""
+"""Plans run by the simulator: commands that follow them, figures, and kept constraints."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
 
 import numpy as np
 
-from sdc_taichi.optimum.commands import (
-    arrived_tasks,
-    battery_command,
-    bus_energy_kwh,
-    load_command,
-    setpoint_command,
-)
 from sdc_taichi.optimum.objective import Objective, Score
-from sdc_taichi.optimum.problem import Problem
+from sdc_taichi.optimum.problem import Problem, arrived_tasks
 from sdc_taichi.optimum.tables import (
     INLET_MARGIN_K,
     at_utilisation,
     coolest_inlet_c,
     facility_kwh,
 )
+from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
+from sdc_taichi.plant.cooling import avoid_repeats
+from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.facility import battery_parameters
-from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_entries, due_steps, due_work, queue_limit_tasks
 from sdc_taichi.types import F64, I64, Actions, State, StepResult
-
-Stop = Callable[[], bool]
-"""Function that returns whether to end the work; called before every step."""
-OnStep = Callable[[], None]
-"""Called after every step that a simulator has done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +95,8 @@ def roll_out(
     scored_from: int = 0,
     seed: int | I64 = 0,
     precision: Precision = "f32",
-    on_step: OnStep | None = None,
-    stop: Stop | None = None,
-) -> tuple[RollOut, Score] | None:
+    on_step: Callable[[], None] = lambda: None,
+) -> tuple[RollOut, Score]:
     """Run plans in the simulator: commands are computed at the true state of every step.
 
     All CRAC units of a data center move alike.
@@ -121,11 +110,10 @@ def roll_out(
         scored_from: First step that is scored.
         seed: Of the sampled events, one for all or for each data center, (B,).
         precision: Of the hall kernels.
-        on_step: Called after every step.
-        stop: Asked before every step.
+        on_step: Called after every step; an error that it raises ends the work.
 
     Returns:
-        What they did, and its score; None where ``stop`` ended the work.
+        What they did, and its score.
 
     Raises:
         PhysicalLimitError: A result that no data center can reach.
@@ -133,64 +121,39 @@ def roll_out(
     steps = len(targets.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
         sim.reset(seed, start=start)
-        follow = Follower(sim, targets)
+        follower = Follower(fleet, drivers, sim.sizing, targets)
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
         for t in range(steps):
-            if stop is not None and stop():
-                return None
-            result: StepResult = sim.step(follow.actions(sim.state))
+            result: StepResult = sim.step(follower.actions(sim.state))
             score.add(result)
             for name, values in done.items():
                 values[t] = getattr(result, name)
-            if on_step is not None:
-                on_step()
+            on_step()
     return RollOut(**done), score
-
-
-class Followed(Protocol):
-    """Data centers that are taken along a path, such as a simulator that has been reset."""
-
-    @property
-    def fleet(self) -> Fleet:
-        """The data centers, B."""
-
-    @property
-    def drivers(self) -> Drivers:
-        """Their inputs."""
-
-    @property
-    def sizing(self) -> Sizing:
-        """Capacities of their devices."""
-
-    @property
-    def step_h(self) -> float:
-        """Length of a step, in h."""
-
-    @property
-    def state(self) -> State:
-        """Their state before the first step."""
 
 
 class Follower:
     """Commands that take data centers to their targets.
 
     Args:
-        of: The data centers before their first step.
-        targets: What they are to do.
+        fleet: B data centers.
+        drivers: Their inputs.
+        sizing: Capacities of their devices.
+        targets: States that they are to reach.
     """
 
-    def __init__(self, of: Followed, targets: Targets) -> None:
-        fleet = of.fleet
+    def __init__(self, fleet: Fleet, drivers: Drivers, sizing: Sizing, targets: Targets) -> None:
         v, models = fleet.values, fleet.models
-        self._drivers, self._step_h, self._targets = of.drivers, of.step_h, targets
+        self._drivers, self._targets = drivers, targets
+        self._step_h = 1.0 / fleet.steps_per_hour
         self._work = {
             "flexible_share": v("workload.flexible_share"),
             "max_utilisation": v("workload.max_utilisation"),
             "queue_limit_tasks": queue_limit_tasks(fleet),
         }
         self._work_model, self._battery_model = models["workload"], models["battery"]
-        self._due = due_entries(of.state.queue.shape[1], due_steps(fleet))
+        self._due_steps = due_steps(fleet)
         self._battery = battery_parameters(fleet)
         loses = self._battery_model != "released"
         one = np.ones(fleet.size)
@@ -198,7 +161,7 @@ class Follower:
             name: getattr(self._battery, name) if loses else one
             for name in ("charge_efficiency", "discharge_factor")
         }
-        self._capacity_kwh = of.sizing.battery_kwh
+        self._capacity_kwh = sizing.battery_kwh
         self._step_k = v("hvac.setpoint.step_k")[fleet.unit_dc]
         self._unit_dc = fleet.unit_dc
 
@@ -209,7 +172,9 @@ class Follower:
             state: State before the step.
         """
         return Actions(
-            load=self._load(state), cooling=self._cooling(state), battery=self._battery_(state)
+            load=self._load(state),
+            cooling=self._cooling(state),
+            battery=self._battery_command(state),
         )
 
     def _load(self, state: State) -> F64:
@@ -224,20 +189,16 @@ class Follower:
             model=self._work_model,
             demand=demand,
             waiting_tasks=queue[:, -1],
-            due_tasks=due_work(queue, self._due),
+            due_tasks=due_work(queue, due_entries(queue.shape[1], self._due_steps)),
             **self._work,
         )
         return np.where(moves, command, 0.0)
 
     def _cooling(self, state: State) -> F64:
-        return setpoint_command(
-            self._targets.setpoint_c[state.step][self._unit_dc],
-            setpoint_c=state.setpoint_c,
-            step_k=self._step_k,
-            last=state.cooling_last,
-        )
+        rise_k = self._targets.setpoint_c[state.step][self._unit_dc] - state.setpoint_c
+        return avoid_repeats(rise_k / self._step_k, state.cooling_last)
 
-    def _battery_(self, state: State) -> F64:
+    def _battery_command(self, state: State) -> F64:
         target, stored = self._targets.stored_kwh[state.step], state.stored_kwh
         moves = ~np.isnan(target)
         bus_kwh = bus_energy_kwh(np.where(moves, target, stored), stored, **self._efficiency)
@@ -252,20 +213,131 @@ class Follower:
         )
 
 
-def repeated(fleet: Fleet, drivers: Drivers, start: I64, times: int) -> tuple[Fleet, Drivers, I64]:
-    """Copies of a fleet in one: data center b of copy k is number k*B + b.
+def load_command(
+    executed_tasks: F64,
+    *,
+    model: str,
+    demand: F64,
+    waiting_tasks: F64,
+    due_tasks: F64,
+    flexible_share: F64,
+    max_utilisation: F64,
+    queue_limit_tasks: F64,
+) -> F64:
+    """Load command by which a step does some amount of work, or comes as close as it can, (B,).
+
+    It inverts the models of ``plant.workload``. Work whose deadline has come runs in any case, and
+    no more is deferred than fits into the queue, so that nothing is dropped for a plan. Model
+    ``tasks`` does the nearest whole number of tasks.
 
     Args:
-        fleet: B data centers.
-        drivers: Their inputs.
-        start: First step of each, (B,).
-        times: Number of copies.
-
-    Returns:
-        Fleet, drivers and first steps of all copies.
+        executed_tasks: work to do, in tasks, (B,).
+        model: name of the model of work, ``fluid`` or ``tasks``.
+        demand: work that arrives, as a share of capacity, 0..1, (B,).
+        waiting_tasks: work in the queue, in tasks, (B,).
+        due_tasks: part of it whose deadline has come, in tasks, (B,).
+        flexible_share: share of the demand that may wait, 0..1, (B,).
+        max_utilisation: highest utilisation, 0..1, (B,).
+        queue_limit_tasks: longest queue, in tasks, (B,).
     """
-    copies = drivers.take(list(range(fleet.size)) * times)
-    return build_fleet(fleet.configs * times), copies, np.tile(start, times)
+    of_model = _tasks_command if model == "tasks" else _fluid_command
+    return of_model(
+        executed_tasks,
+        demand,
+        waiting_tasks,
+        due_tasks,
+        flexible_share,
+        max_utilisation,
+        queue_limit_tasks,
+    )
+
+
+def _fluid_command(
+    executed: F64, demand: F64, waiting: F64, due: F64, flexible_share: F64, cap: F64, limit: F64
+) -> F64:
+    """Load command of model ``fluid``, (B,); see ``load_command``."""
+    arrived, capacity = demand * TASKS_PER_STEP, cap * TASKS_PER_STEP
+    forced = np.minimum(due, capacity)
+    room = np.maximum(limit - (waiting - forced), 0.0)
+    most_held_back = np.minimum(flexible_share * arrived, room)
+    neutral = np.minimum(arrived, capacity - forced) + forced
+    drain = _share(executed - neutral, capacity - neutral)
+    defer = _share(
+        np.minimum(arrived + forced - executed, most_held_back), flexible_share * arrived
+    )
+    return np.where(executed >= neutral, drain, -defer)
+
+
+def _tasks_command(
+    executed: F64, demand: F64, waiting: F64, due: F64, flexible_share: F64, cap: F64, limit: F64
+) -> F64:
+    """Load command of model ``tasks``, (B,); see ``load_command``."""
+    flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
+    arrived = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP) + flexible
+    capacity = np.floor(cap * TASKS_PER_STEP)
+    forced = np.minimum(due, np.maximum(capacity - arrived, 0.0))
+    room = np.maximum(limit - (waiting - forced), 0.0)
+    more = np.rint(executed - arrived - forced)
+    free = np.maximum(capacity - arrived - forced, 0.0)
+    drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
+    held_back = np.minimum(np.minimum(-more, flexible), np.floor(room))
+    # The models round down: half a task more than a whole number gives just this number.
+    drain = np.where(more > 0, _share(more + 0.5, drainable), 0.0)
+    defer = np.where(held_back > 0, _share(held_back + 0.5, flexible), 0.0)
+    return np.where(more >= 0, drain, -defer)
+
+
+def battery_command(
+    bus_kwh: F64,
+    *,
+    model: str,
+    stored_kwh: F64,
+    load_kw: F64,
+    step_h: float,
+    capacity_kwh: F64,
+    parameters: BatteryParameters,
+) -> F64:
+    """Battery command by which a step draws or delivers some energy, or as much as it can, (B,).
+
+    Args:
+        bus_kwh: energy to draw from the bus into the battery, below 0 to deliver, in kWh, (B,).
+        model: name of the battery model.
+        stored_kwh: energy in the store before the step, in kWh, (B,).
+        load_kw: power that the facility is expected to draw, in kW, (B,).
+        step_h: length of the step, in h.
+        capacity_kwh: capacity, in kWh, (B,).
+        parameters: efficiencies, rates and limits, (B,) each; the limit of the grid connection is
+            left to the model.
+    """
+    charges = bus_kwh >= 0
+    full = BATTERIES[model].step(
+        stored_kwh,
+        np.where(charges, 1.0, -1.0),
+        BatteryPoint(capacity_kwh, load_kw, step_h, parameters),
+    )
+    share = _share(np.abs(bus_kwh), np.where(charges, full.charge_kwh, full.discharge_kwh))
+    return np.where(charges, share, -share)
+
+
+def bus_energy_kwh(
+    target_kwh: F64, stored_kwh: F64, *, charge_efficiency: F64, discharge_factor: F64
+) -> F64:
+    """Energy to draw from the bus, below 0 to deliver, that brings a store to a target, kWh, (B,).
+
+    Args:
+        target_kwh: energy to be stored, in kWh, (B,).
+        stored_kwh: energy in the store, in kWh, (B,).
+        charge_efficiency: energy stored per energy drawn, (B,).
+        discharge_factor: energy taken from the store per energy delivered, (B,).
+    """
+    rise_kwh = target_kwh - stored_kwh
+    return np.where(rise_kwh >= 0, rise_kwh / charge_efficiency, rise_kwh / discharge_factor)
+
+
+def _share(part: F64, whole: F64) -> F64:
+    """Part of a whole, within 0..1; 0 where there is nothing to share."""
+    some = whole > 0
+    return np.where(some, np.clip(part / np.where(some, whole, 1.0), 0.0, 1.0), 0.0)
 
 
 LARGEST_TABLE_ERROR = 1e-4

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TypeVar
@@ -35,7 +36,6 @@ from sdc_taichi.optimum.rollout import (
     RollOut,
     Targets,
     certificate,
-    repeated,
     roll_out,
 )
 from sdc_taichi.optimum.task import (
@@ -68,7 +68,6 @@ _POLL_S = 0.2
 """Time between two calls of ``stop``, in s."""
 
 _X = TypeVar("_X")
-_Y = TypeVar("_Y")
 Progress = Callable[[str, int, int], None]
 """Progress callback ``(stage, done, total)``."""
 
@@ -183,18 +182,6 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
 
 
 @dataclass(frozen=True, slots=True)
-class _Suggestion:
-    """What the programmes say of one data center."""
-
-    bound: float
-    """Bound of the figure; nan without one."""
-    no_bound: str | None
-    """Why there is no bound, in words; None where there is one."""
-    paths: dict[str, Targets]
-    """Paths to run, by name."""
-
-
-@dataclass(frozen=True, slots=True)
 class _Run:
     """A path of one data center that the simulator has run."""
 
@@ -206,107 +193,60 @@ class _Run:
     """What was measured in the scored steps."""
 
 
-def _suggested(
-    given: tuple[Problem, str | None, str], stop: Callable[[], bool]
-) -> float | Targets | ConfigError:
-    """Bound or path of a data center; an error where no plan keeps the limits.
+@dataclass(slots=True)
+class _Case:
+    """A data center and what is known of it so far."""
 
-    Args:
-        given: Its planning problem, why its table does not hold all that a step costs, and
-            ``_BOUND`` or the name of a path.
-        stop: Returns whether to end the work.
+    problem: Problem
+    """Its planning problem."""
+    no_bound: str | None
+    """Why there is no bound, in words; None where there is one."""
+    bound: float = float("nan")
+    """Bound of the figure; nan without one."""
+    runs: dict[str, _Run] = field(default_factory=dict)
+    """Paths that have been run, by name."""
 
-    Raises:
-        StoppedError: ``stop`` was true.
-    """
-    problem, reason, name = given
-    try:
-        if name != _BOUND:
-            return path_of(problem, agents_of(problem)[name], stop)
-        return float("nan") if reason else bound(problem, stop=stop).figure
-    except ConfigError as error:
-        return error
+    @property
+    def joint(self) -> _Run:
+        """The run that moves all agents."""
+        return self.runs[JOINT if JOINT in self.runs else self.problem.agents[0]]
 
+    def entry(self) -> Entry:
+        """What is known of the data center, from all its runs."""
+        certificates = {name: run.certificate for name, run in self.runs.items()}
+        idle = certificates[IDLE]
+        failures = {
+            name: of_path.failures(idle, self.problem.storage.capacity_kwh)
+            for name, of_path in certificates.items()
+        }
+        valid = [name for name, texts in failures.items() if not texts] or [IDLE]
 
-def _suggestion(
-    problem: Problem, reason: str | None, found: Mapping[str, float | Targets | ConfigError]
-) -> _Suggestion:
-    """What is known of a data center, from its bound and its paths by name."""
-    errors = [each for each in found.values() if isinstance(each, ConfigError)]
-    if errors:
-        idle = path_of(problem, ())
-        return _Suggestion(
-            float("nan"), reason or str(errors[0]), dict.fromkeys(agents_of(problem), idle)
+        def best_of(names: Iterable[str]) -> str:
+            return min(names, key=lambda name: certificates[name].figure)
+
+        best = best_of(valid)
+        error = max(of_path.table_error for of_path in certificates.values())
+        done = self.runs[best].done
+        return Entry(
+            idle=idle.figure,
+            idle_dropped_tasks=idle.dropped_tasks,
+            # By as much as tables were found to differ from the simulator, and solvers may err.
+            bound=self.bound - (error + _SOLVER_ERROR) * abs(self.bound),
+            achieved=certificates[best].figure,
+            alone={
+                agent: certificates[best_of({agent, IDLE}.intersection(valid) or {IDLE})].figure
+                for agent in self.problem.agents
+            },
+            kind=_kind(self.no_bound, error),
+            failures=tuple(
+                f"the path of {name} {text}" for name, texts in failures.items() for text in texts
+            ),
+            certificate=asdict(certificates[best])
+            | {"table_error": error, "inlet_limit_c": self.problem.inlet_limit_c},
+            load=done.load_command[:, 0],
+            cooling=done.cooling_command[:, 0],
+            battery=done.battery_command[:, 0],
         )
-    figure = found[_BOUND]
-    assert isinstance(figure, float)
-    paths = {name: path for name, path in found.items() if isinstance(path, Targets)}
-    return _Suggestion(figure, reason, paths)
-
-
-def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
-    """The run that moves all agents."""
-    return runs[JOINT if JOINT in runs else problem.agents[0]]
-
-
-def _battery_again(given: tuple[Problem, _Run], _stop: Callable[[], bool]) -> Targets:
-    """The path of a run with a battery that suits the energy that the simulator measured."""
-    problem, run = given
-    return with_battery_for(problem, run.path, run.done.facility_kwh[:, 0])
-
-
-def _beside(paths: Sequence[Targets]) -> Targets:
-    """Paths of several data centers in one."""
-    return Targets(
-        *(
-            np.concatenate([getattr(path, f.name) for path in paths], axis=1)
-            for f in fields(Targets)
-        )
-    )
-
-
-def _energy_error(run: _Run) -> float:
-    """Difference of the facility's energy from what was expected, as a share of all of it."""
-    found_kwh = run.done.facility_kwh
-    return float(np.abs(run.path.facility_kwh - found_kwh).sum() / found_kwh.sum())
-
-
-def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) -> Entry:
-    """What is known of a data center, from all its runs."""
-    certificates = {name: run.certificate for name, run in runs.items()}
-    idle = certificates[IDLE]
-    failures = {
-        name: of_path.failures(idle, problem.storage.capacity_kwh)
-        for name, of_path in certificates.items()
-    }
-    valid = [name for name, texts in failures.items() if not texts] or [IDLE]
-
-    def best_of(names: Iterable[str]) -> str:
-        return min(names, key=lambda name: certificates[name].figure)
-
-    best = best_of(valid)
-    error = max(of_path.table_error for of_path in certificates.values())
-    done = runs[best].done
-    return Entry(
-        idle=idle.figure,
-        idle_dropped_tasks=idle.dropped_tasks,
-        # By as much as tables were found to differ from the simulator, and solvers may err.
-        bound=suggestion.bound - (error + _SOLVER_ERROR) * abs(suggestion.bound),
-        achieved=certificates[best].figure,
-        alone={
-            agent: certificates[best_of({agent, IDLE}.intersection(valid) or {IDLE})].figure
-            for agent in problem.agents
-        },
-        kind=_kind(suggestion.no_bound, error),
-        failures=tuple(
-            f"the path of {name} {text}" for name, texts in failures.items() for text in texts
-        ),
-        certificate=asdict(certificates[best])
-        | {"table_error": error, "inlet_limit_c": problem.inlet_limit_c},
-        load=done.load_command[:, 0],
-        cooling=done.cooling_command[:, 0],
-        battery=done.battery_command[:, 0],
-    )
 
 
 def _kind(reason: str | None, error: float) -> str:
@@ -319,6 +259,24 @@ def _kind(reason: str | None, error: float) -> str:
             "energy"
         )
     return "bound"
+
+
+def _bound_or_path(
+    case: _Case, name: str, check: Callable[[], None]
+) -> float | Targets | ConfigError:
+    """Bound or path of a data center; an error where no plan keeps the limits.
+
+    Args:
+        case: The data center.
+        name: ``_BOUND`` or the name of a path.
+        check: Raises an error to end the work.
+    """
+    try:
+        if name != _BOUND:
+            return path_of(case.problem, agents_of(case.problem)[name], check)
+        return float("nan") if case.no_bound else bound(case.problem, check=check).figure
+    except ConfigError as error:
+        return error
 
 
 class _Work:
@@ -344,102 +302,99 @@ class _Work:
             StoppedError: The work was stopped.
         """
         keys = [""] * task.fleet.size if cache is None else task.keys()
-        found: dict[int, Entry] = {}
+        entries: dict[int, Entry] = {}
         if cache is not None:
             known = {i: cache.find(key, task.steps) for i, key in enumerate(keys)}
-            found = {i: entry for i, entry in known.items() if entry is not None}
-        missing = [i for i in range(task.fleet.size) if i not in found]
-        self._all, self._kept, self._missing = len(keys), len(found), len(missing)
+            entries = {i: entry for i, entry in known.items() if entry is not None}
+        missing = [i for i in range(task.fleet.size) if i not in entries]
+        self._all, self._kept, self._missing = len(keys), len(entries), len(missing)
         for part in task.parts(missing):
             self._size = len(part)
-            for i, entry in zip(part, self._solve(task.part(part)), strict=True):
-                found[i] = entry
+            for i, case in zip(part, self._solve(task.part(part)), strict=True):
+                entries[i] = case.entry()
                 if cache is not None:
-                    cache.keep(keys[i], entry)
+                    cache.keep(keys[i], entries[i])
             self._solved += len(part)
             self._kept += len(part) if cache is not None else 0
-        return [found[i] for i in range(task.fleet.size)]
+        return [entries[i] for i in range(task.fleet.size)]
 
-    def _solve(self, task: Task) -> list[Entry]:
-        """Entries of data centers whose tables fit into memory together, B."""
-        steps = task.steps
-        tables = task.tables(
-            lambda done, total: self._tell("tables", done / total, steps),
-            self._stop,
-        )
-        if not tables:
-            raise self._stopped()
-        problems = task.problems(tables)
-        reasons = [
-            of_config
-            or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
-            or forced_discharge_reason(problem)
+    def _solve(self, task: Task) -> list[_Case]:
+        """Bounds and runs of data centers whose tables fit into memory together, B."""
+        problems = task.problems(lambda done, total: self._tell("tables", done / total, task.steps))
+        cases = [
+            _Case(
+                problem,
+                of_config
+                or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
+                or forced_discharge_reason(problem),
+            )
             for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
         ]
-        suggestions = self._suggestions(problems, reasons)
-        runs = self._run(task, problems, [suggestion.paths for suggestion in suggestions])
-        self._plan_batteries_again(task, problems, runs)
-        return [
-            _entry(problem, suggestion, of)
-            for problem, suggestion, of in zip(problems, suggestions, runs, strict=True)
-        ]
+        self._run(task, cases, self._bounds_and_paths(cases))
+        self._plan_batteries_again(task, cases)
+        return cases
 
-    def _plan_batteries_again(
-        self, task: Task, problems: Sequence[Problem], runs: Sequence[dict[str, _Run]]
-    ) -> None:
+    def _bounds_and_paths(self, cases: Sequence[_Case]) -> list[dict[str, Targets]]:
+        """Find the bound of each data center, and its paths by name, B."""
+        names = [*reversed(agents_of(cases[0].problem)), _BOUND]
+        results = self._in_threads(
+            [partial(_bound_or_path, case, name) for case in cases for name in names]
+        )
+        paths = []
+        for i, case in enumerate(cases):
+            of_case = dict(zip(names, results[i * len(names) :], strict=False))
+            figure = of_case.pop(_BOUND)
+            errors = [each for each in (*of_case.values(), figure) if isinstance(each, ConfigError)]
+            if errors:
+                case.no_bound = case.no_bound or str(errors[0])
+                idle = path_of(case.problem, ())
+                paths.append(dict.fromkeys(agents_of(case.problem), idle))
+                continue
+            case.bound = float(figure)  # type: ignore[arg-type]
+            paths.append({name: x for name, x in of_case.items() if isinstance(x, Targets)})
+        return paths
+
+    def _plan_batteries_again(self, task: Task, cases: Sequence[_Case]) -> None:
         """Where the energy is not what was planned for, add a run whose battery suits it."""
-        chosen = {}
-        for i, problem in enumerate(problems):
-            run = _joint(problem, runs[i])
-            if "battery" in problem.agents and _energy_error(run) > _LEAST_ENERGY_ERROR:
-                chosen[i] = run
+        chosen = []
+        for i, case in enumerate(cases):
+            planned, found = case.joint.path.facility_kwh, case.joint.done.facility_kwh
+            error = float(np.abs(planned - found).sum() / found.sum())
+            if "battery" in case.problem.agents and error > _LEAST_ENERGY_ERROR:
+                chosen.append(i)
         if not chosen:
             return
-        plans = self._side_by_side(
-            _battery_again, [(problems[i], run) for i, run in chosen.items()], "programmes"
-        )
-        again = self._run(
-            task.part(list(chosen)),
-            [problems[i] for i in chosen],
-            [{_AGAIN: path} for path in plans],
-        )
-        for i, of in zip(chosen, again, strict=True):
-            runs[i].update(of)
 
-    def _suggestions(
-        self, problems: Sequence[Problem], reasons: Sequence[str | None]
-    ) -> list[_Suggestion]:
-        """Bounds and paths of data centers, B."""
-        names = [*reversed(agents_of(problems[0])), _BOUND]
-        known = list(zip(problems, reasons, strict=True))
-        given = [(*each, name) for each in known for name in names]
-        found = self._side_by_side(_suggested, given, "programmes")
-        return [
-            _suggestion(*each, dict(zip(names, found[i * len(names) :], strict=False)))
-            for i, each in enumerate(known)
-        ]
+        def battery_again(case: _Case, _check: Callable[[], None]) -> Targets:
+            run = case.joint
+            return with_battery_for(case.problem, run.path, run.done.facility_kwh[:, 0])
 
-    def _side_by_side(
-        self, find: Callable[[_X, Callable[[], bool]], _Y], given: Sequence[_X], stage: str
-    ) -> list[_Y]:
-        """What a function finds, several calls at a time.
+        again = [cases[i] for i in chosen]
+        paths = self._in_threads([partial(battery_again, case) for case in again])
+        self._run(task.part(chosen), again, [{_AGAIN: path} for path in paths])
+
+    def _in_threads(self, calls: Sequence[Callable[[Callable[[], None]], _X]]) -> list[_X]:
+        """Results of programmes, several solved at a time.
 
         Args:
-            find: A function of its argument and of what to ask whether to stop, which leaves the
-                interpreter to others for most of its time.
-            given: Argument of each call.
-            stage: Name of the stage.
+            calls: Functions of what raises an error to end the work, which leave the interpreter
+                to others for most of their time.
         """
         pool, ends = ThreadPoolExecutor(runtime.ensure_started()), Event()
+
+        def check() -> None:
+            if ends.is_set():
+                raise self._stopped()
+
         try:
-            futures = [pool.submit(find, each, ends.is_set) for each in given]
+            futures = [pool.submit(call, check) for call in calls]
             waiting = set(futures)
             while waiting:
-                if self._stop():
-                    raise self._stopped()
+                self._go_on()
                 _, waiting = wait(waiting, timeout=_POLL_S)
-                share = 1.0 - len(waiting) / len(given)
-                self._progress(stage, self._solved + round(share * self._size), self._missing)
+                share = 1.0 - len(waiting) / len(calls)
+                done = self._solved + round(share * self._size)
+                self._progress("programmes", done, self._missing)
             return [future.result() for future in futures]
         finally:
             ends.set()
@@ -449,51 +404,53 @@ class _Work:
         """Tell how much of a stage of the present part is done, in steps of data centers."""
         done = self._solved + share * self._size
         self._progress(stage, round(done * steps), self._missing * steps)
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Raise a ``StoppedError`` if the work is to end."""
+        if self._stop():
+            raise self._stopped()
 
     def _stopped(self) -> StoppedError:
         return StoppedError(f"optima of {self._kept} of {self._all} data centers are kept")
 
     def _run(
-        self, task: Task, problems: Sequence[Problem], paths: Sequence[Mapping[str, Targets]]
-    ) -> list[dict[str, _Run]]:
-        """What the simulator does along the paths of each data center, by name, B.
+        self, task: Task, cases: Sequence[_Case], paths: Sequence[Mapping[str, Targets]]
+    ) -> None:
+        """Run the paths of each data center in the simulator, all in one batch.
 
         Args:
             task: The data centers, B.
-            problems: Their planning problems, B.
+            cases: What is known of them, B, to which the runs are added.
             paths: Paths of each, of the same names, B.
         """
-        names, steps = list(paths[0]), 0
-        fleet, drivers, start = repeated(task.fleet, task.drivers, task.start, len(names))
-        stacked = _beside([of[name] for name in names for of in paths])
+        names, size, steps = list(paths[0]), task.fleet.size, 0
+        # Path k of data center i is number k*B + i.
+        in_order = [of_case[name] for name in names for of_case in paths]
 
         def on_step() -> None:
             nonlocal steps
             steps += 1
             self._tell("runs", steps / task.steps, task.steps)
 
-        rolled_out = roll_out(
-            fleet,
-            drivers,
-            stacked,
-            start=start,
+        done, score = roll_out(
+            build_fleet(task.fleet.configs * len(names)),
+            task.drivers.take(list(range(size)) * len(names)),
+            Targets(
+                *(
+                    np.concatenate([getattr(path, f.name) for path in in_order], axis=1)
+                    for f in fields(Targets)
+                )
+            ),
+            start=np.tile(task.start, len(names)),
             objective=task.objective,
             scored_from=task.scored_from,
             seed=np.tile(task.seed, len(names)),
             precision=task.precision,
             on_step=on_step,
-            stop=self._stop,
         )
-        if rolled_out is None:
-            raise self._stopped()
-        done, score = rolled_out
-
-        def run_of(i: int, k: int, name: str) -> _Run:
-            """Run of path k, by its name, of data center i."""
-            at = k * len(paths) + i
-            own = done.of([at])
-            return _Run(paths[i][name], own, certificate(problems[i], own, score, at))
-
-        return [
-            {name: run_of(i, k, name) for k, name in enumerate(names)} for i in range(len(paths))
-        ]
+        for at, path in enumerate(in_order):
+            case, of_path = cases[at % size], done.of([at])
+            case.runs[names[at // size]] = _Run(
+                path, of_path, certificate(case.problem, of_path, score, at)
+            )

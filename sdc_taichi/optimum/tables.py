@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +77,8 @@ class Nodes:
 
 
 OnStep = Callable[[int, int], None]
-"""Progress callback ``(done, total)`` in steps of data centers."""
+"""Progress callback ``(done, total)`` in steps of data centers; an error that it raises ends the
+work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,6 @@ def facility_tables(
     grid: TableGrid = TableGrid(),
     precision: Precision = "f32",
     on_step: OnStep | None = None,
-    stop: Callable[[], bool] | None = None,
 ) -> list[FacilityTable]:
     """Tables of data centers over the steps of a run.
 
@@ -136,10 +137,9 @@ def facility_tables(
         grid: Where the tables have their nodes.
         precision: Of the server kernels.
         on_step: Called after every step of a batch of data centers.
-        stop: Asked before every step; true ends with no table.
 
     Returns:
-        A table for each data center, B; none where ``stop`` was true.
+        A table for each data center, B.
 
     Raises:
         PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
@@ -162,10 +162,8 @@ def facility_tables(
             if on_step is not None:
                 on_step(before + size * step, len(distinct) * steps)
 
-        found = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, tell, stop)
-        if found is None:
-            return []
-        tables |= {own.dc: table for own, table in zip(batch, found, strict=True)}
+        of_batch = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, tell)
+        tables |= {own.dc: table for own, table in zip(batch, of_batch, strict=True)}
     return [tables[dc] for dc in table_of]
 
 
@@ -177,8 +175,7 @@ def tabulate(
     wet_bulb_c: F64,
     precision: Precision,
     on_step: Callable[[int], None] | None = None,
-    stop: Callable[[], bool] | None = None,
-) -> list[FacilityTable] | None:
+) -> list[FacilityTable]:
     """Tables of some data centers over given weather, in one batch.
 
     Args:
@@ -189,10 +186,9 @@ def tabulate(
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
         precision: Of the server kernels.
         on_step: Called after every step with the number of those done.
-        stop: Asked before every step.
 
     Returns:
-        A table for each, n; None where ``stop`` was true.
+        A table for each, n.
     """
     place = np.repeat(np.arange(len(nodes)), [each.copies for each in nodes])
     of = np.array([each.dc for each in nodes])[place]
@@ -204,28 +200,17 @@ def tabulate(
         setpoint_c=np.concatenate([np.tile(x.setpoint_c, len(x.utilisation)) for x in nodes]),
         precision=precision,
     )
-    try:
-        found = _through_weather(
-            facility,
-            place,
-            outdoor_c,
-            wet_bulb_c,
-            _throttles(fleet, facility, of),
-            on_step,
-            stop,
-        )
-    finally:
-        facility.close()
-    if found is None:
-        return None
-    found["inlet_max_c"] = facility.inlet_max_c[None]
+    with closing(facility):
+        throttles = _throttles(fleet, facility, of)
+        values = _through_weather(facility, place, outdoor_c, wet_bulb_c, throttles, on_step)
+    values["inlet_max_c"] = facility.inlet_max_c[None]
     firsts = np.cumsum([0, *(each.copies for each in nodes)])
     steps = outdoor_c.shape[1]
     return [
         FacilityTable(
             utilisation=each.utilisation,
             setpoint_c=each.setpoint_c,
-            **{name: _of_one(x, int(first), steps, each) for name, x in found.items()},
+            **{name: _of_one(x, int(first), steps, each) for name, x in values.items()},
         )
         for first, each in zip(firsts, nodes, strict=False)
     ]
@@ -329,7 +314,7 @@ def _fine_enough(
             _series_of(series, batch, start, steps)[:, sampled]
             for series in (drivers.outdoor_c, drivers.wet_bulb_c)
         )
-        for table in tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision) or ():
+        for table in tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision):
             errors = (
                 _error_midway(finest, table.facility_kwh, (len(finest) - 1) // (count - 1))
                 for count in UTILISATIONS[:-1]
@@ -368,10 +353,9 @@ def _through_weather(
     place: I64,
     outdoor_c: F64,
     wet_bulb_c: F64,
-    barred: Mask,
+    throttles: Mask,
     on_step: Callable[[int], None] | None,
-    stop: Callable[[], bool] | None,
-) -> dict[str, F64] | None:
+) -> dict[str, F64]:
     """Energy, water and unmet load of copies, (T, B) each or (1, B), by their names in a table.
 
     Args:
@@ -379,20 +363,17 @@ def _through_weather(
         place: Row of the weather that each copy has, (B,).
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
-        barred: Whether racks of each copy would throttle, (B,).
+        throttles: Whether racks of each copy would throttle, (B,).
         on_step: Called after every step with the number of those done.
-        stop: Asked before every step; true ends with None.
     """
     copies, steps = len(place), outdoor_c.shape[1]
     facility_kwh, water_l = (np.empty((steps, copies)) for _ in range(2))
     # Mostly all heat is removed, and one row stands for all steps.
     unmet_w = np.zeros((1, copies))
     for step in range(steps):
-        if stop is not None and stop():
-            return None
-        found = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
-        facility_kwh[step], water_l[step] = found.facility_kwh, found.water_l
-        short_w = np.where(barred, np.inf, found.unmet_w)
+        result = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
+        facility_kwh[step], water_l[step] = result.facility_kwh, result.water_l
+        short_w = np.where(throttles, np.inf, result.unmet_w)
         if len(unmet_w) < steps and short_w.any():
             unmet_w = np.zeros((steps, copies))
         if short_w.any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.cache import key_of
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
-from sdc_taichi.optimum.tables import UTILISATIONS, FacilityTable, TableGrid, facility_tables
+from sdc_taichi.optimum.tables import UTILISATIONS, OnStep, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -111,33 +111,20 @@ class Task:
             keys.append(key_of(fingerprint, options | own))
         return keys
 
-    def tables(
-        self,
-        on_step: Callable[[int, int], None] | None = None,
-        stop: Callable[[], bool] | None = None,
-    ) -> list[FacilityTable]:
-        """Tables of each data center, B; none where ``stop`` ended the work.
+    def problems(self, on_step: OnStep | None = None) -> list[Problem]:
+        """The planning problem of each data center, B.
 
         Args:
-            on_step: Progress callback ``(done, total)`` in steps of data centers.
-            stop: Returns whether to end the work.
+            on_step: Progress callback of the tables of what steps cost.
         """
-        return facility_tables(
+        tables = facility_tables(
             self.fleet,
             self.drivers,
             start=self.start,
             steps=self.steps,
             precision=self.precision,
             on_step=on_step,
-            stop=stop,
         )
-
-    def problems(self, tables: Sequence[FacilityTable]) -> list[Problem]:
-        """The planning problem of each data center, B.
-
-        Args:
-            tables: what their steps cost, B.
-        """
         with Simulator(self.fleet, drivers=self.drivers, precision=self.precision) as sim:
             return problems_of(
                 self.fleet,
