@@ -188,7 +188,7 @@ def cases() -> Iterator[tuple[str, Any]]:
 
 
 def processor() -> str:
-    from sdc_taichi.run.processor import processor_features
+    from sdc_taichi.run.description import processor_features
 
     return "; ".join(f"{name} {value}" for name, value in processor_features().items())
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.run.processor import processor_features
+from sdc_taichi.run.description import processor_features
 
 TESTS = ("reference", "ledgers", "kernels", "transients", "airflow", "air_metrics")
 """Test files that hold results against other computations: parity, ledgers, halls and kernels."""

@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from sdc_taichi.benchmark.suite import Suite, load_suite
-from sdc_taichi.run.processor import processor_features
+from sdc_taichi.run.description import processor_features
 
 FOLDER = Path(__file__).parent / "reference" / "benchmark"
 SUITES = ("paper", "carbon", "carbon-rich", "bill", "failures", "elsewhere")

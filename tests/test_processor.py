@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sdc_taichi import Drivers, Simulator, drivers_from_arrays, load_config
-from sdc_taichi.run.processor import processor_features
+from sdc_taichi.run.description import processor_features
 from sdc_taichi.sim.drivers import FleetSeries
 
 

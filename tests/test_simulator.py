@@ -352,7 +352,6 @@ def broken(**changes: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         (broken(setpoint_c=np.zeros(3)), r"setpoint_c is float64 \(3,\), expected float64 \(1,\)"),
         (broken(stored_kwh=np.zeros(1, np.float32)), "stored_kwh is float32"),
         (broken(cooling_run=np.zeros(1)), "cooling_run is float64"),
-        (lambda of: {**of, "queue": np.eye(*of["queue"].shape)}, "queue falls"),
     ],
 )
 def test_a_wrong_snapshot_is_refused(

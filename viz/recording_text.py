@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
-from sdc_taichi.run.hottest_air import AirAtStep
+from sdc_taichi.run.steps_file import AirAtStep
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.inlet_parts import (

@@ -28,7 +28,7 @@ import rerun as rr
 
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.hottest_air import HottestAir
+from sdc_taichi.run.steps_file import HottestAir
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import hall_rasters as rasters

@@ -16,7 +16,7 @@ from sdc_taichi.benchmark.episodes import Collection, Episode, objective_of_opti
 from sdc_taichi.benchmark.jobs import input_paths
 from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.learning.evaluation_table import literal_markdown, markdown
-from sdc_taichi.run.processor import processor_features
+from sdc_taichi.run.description import processor_features
 from sdc_taichi.sim.fleet_configs import locations
 
 _SCALED = (

@@ -134,7 +134,7 @@ def run_job(job: Job, inputs: Inputs) -> DoneJob:
         The job with its result, or with its error in one line. An error that does not belong to
         the package is reported with its class and place.
     """
-    from sdc_taichi.run.processor import processor_features
+    from sdc_taichi.run.description import processor_features
 
     start_s = time.process_time()
     outcome: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Description of a run before its first step: versions, seed, inputs and data centers."""
+"""Description of a run before its first step: versions, processor, seed, inputs, data centers."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from threadpoolctl import threadpool_info
+
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.exogenous.files import sha256
-from sdc_taichi.run.processor import processor_features
 from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
 FORMAT = "sdc-run/2"
 """Version of the format of metrics.json, which its field ``format`` names."""
+VECTOR_FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "asimd", "sve")
+"""Vector extensions of processors that libraries have special code for, by their names in Linux."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,3 +114,44 @@ def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
     """
     paths = {path for config in configs for path in _input_files(config).values()}
     return {p: sha256(Path(p)) if os.path.isfile(p) else "missing" for p in sorted(paths)}
+
+
+def processor_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
+    """Features by name, the same in every process that sees the same environment.
+
+    ``architecture``: of the processor. ``processor``: those of its ``VECTOR_FEATURES`` that the
+    system tells, for which Taichi compiles. ``numpy-simd``: extensions that NumPy uses.
+    ``openblas``: version of OpenBLAS, and the processor whose code it picked. ``libc``: the C
+    library, whose exponentials and powers differ between versions and processors.
+
+    Args:
+        cpuinfo: What Linux tells of the processor (proc(5)).
+    """
+    simd = np.show_config(mode="dicts")["SIMD Extensions"]
+    openblas = [
+        f"{library['version']} {library['architecture']}"
+        for library in threadpool_info()
+        if library["internal_api"] == "openblas" and "numpy" in library["filepath"]
+    ]
+    return {
+        "architecture": platform.machine() or "unknown",
+        "processor": _vector_features(cpuinfo),
+        "numpy-simd": " ".join([*simd["baseline"], *simd.get("found", [])]),
+        "openblas": ", ".join(openblas) or "unknown",
+        "libc": " ".join(platform.libc_ver()).strip() or platform.system(),
+    }
+
+
+def _vector_features(cpuinfo: Path) -> str:
+    """Features of the first processor; unknown where the system does not tell."""
+    try:
+        lines = cpuinfo.read_text("utf-8", errors="replace").splitlines()
+    except OSError:
+        return "unknown"
+    for line in lines:
+        name, _, features = line.partition(":")
+        # "flags" of x86, "Features" of ARM.
+        if name.strip().lower() in ("flags", "features"):
+            has = features.split()
+            return " ".join(each for each in VECTOR_FEATURES if each in has) or "none"
+    return "unknown"

@@ -9,8 +9,8 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import make_controller
 from sdc_taichi.errors import ConfigError, OddInputWarning, SdcError, shortened
 from sdc_taichi.run.folder_reader import RunFolder, read_configs, read_hottest_air, read_steps
-from sdc_taichi.run.hottest_air import air_from_values
 from sdc_taichi.run.loop import simulate
+from sdc_taichi.run.steps_file import air_from_values
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.sim.simulator import Simulator

@@ -1,10 +1,11 @@
-"""Write the steps of a run as a Parquet file, steps.parquet of a run folder."""
+"""steps.parquet of a run folder: rows of quantities, and in its metadata racks and hottest air."""
 
 from __future__ import annotations
 
 import json
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,11 +13,11 @@ import numpy as np
 
 from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.exogenous.year_clock import step_times
-from sdc_taichi.hall.air_metrics import TIE_K
-from sdc_taichi.run.hottest_air import HottestAir, air_values
+from sdc_taichi.hall.air_metrics import TIE_K, rank
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.inlet_parts import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, StepResult
+from sdc_taichi.types import F64, I64, StepResult, fields_of
 
 STEPS_FILE = "steps.parquet"
 """Name of the file in a run folder."""
@@ -31,10 +32,14 @@ inlet of each rack over the run, in C.
 """
 AIR_KEY = b"sdc_taichi_air"
 """Key of the file's metadata under which the air before the racks is told, as JSON: a list with
-what ``hottest_air.air_values`` says of each data center in its hottest step. Empty for runs of more
+what ``air_values`` says of each data center in its hottest step. Empty for runs of more
 than ``MOST_AIR_RACKS`` racks."""
 MOST_AIR_RACKS = 20_000
 """Most racks of a run whose air is kept."""
+_DECIMALS = 6
+"""Decimals of stored air; temperatures are then right to a millionth of a kelvin."""
+_MOST = 1e9
+"""Bound that no stored value of the air reaches."""
 _ROWS_PER_GROUP = 1 << 16
 _RACKS_AT_A_TIME = 1 << 14
 
@@ -185,3 +190,89 @@ class _RackCounts:
         self._steps += np.count_nonzero(inlet_c >= limit_c[:, self._rack_dc], axis=0)
         self._highest_c = np.maximum(self._highest_c, inlet_c.max(axis=0, initial=-np.inf))
         self._filled = 0
+
+
+@dataclass(frozen=True, slots=True)
+class AirAtStep:
+    """Air before the racks of one data center in one step."""
+
+    step: int
+    """The step, counted from 0 at reset."""
+    air: IntakeAir
+    """Air before its racks."""
+
+
+class HottestAir:
+    """The air of each data center of a simulator in the first of its hottest steps.
+
+    Args:
+        sim: the simulator.
+        dcs: indices of the data centers whose air is kept; None is all.
+    """
+
+    def __init__(self, sim: Simulator, dcs: Sequence[int] | None = None) -> None:
+        self._sim = sim
+        # No inlet of a data center whose air is not kept is hotter.
+        self._rank = np.full(sim.size, -np.inf if dcs is None else np.inf)
+        self._rank[[] if dcs is None else list(dcs)] = -np.inf
+        self._step: I64 = np.full(sim.size, -1, dtype=np.int64)
+        self._air: IntakeAir | None = None
+
+    def add(self, result: StepResult) -> None:
+        """Add the last step of the simulator."""
+        ranks = rank(result.inlet_max_c)
+        hotter = ranks > self._rank
+        if not hotter.any():
+            return
+        self._rank[hotter] = ranks[hotter]
+        self._step[hotter] = result.step
+        found = self._sim.intake_air()
+        if self._air is None or hotter.all():
+            self._air = found
+            return
+        fleet = self._sim.fleet
+        for names, of in ((RACK_FIELDS, fleet.rack_dc), (UNIT_FIELDS, fleet.unit_dc)):
+            for name in names:
+                np.copyto(getattr(self._air, name), getattr(found, name), where=hotter[of])
+
+    def of(self, dc: int) -> AirAtStep | None:
+        """The air of a data center in its hottest step; None before the first step."""
+        if self._air is None:
+            return None
+        return AirAtStep(int(self._step[dc]), intake_air_of(self._sim.fleet, self._air, dc))
+
+
+def air_values(found: AirAtStep) -> dict[str, Any]:
+    """Air as plain values for JSON: ``step``, and a list by rack or CRAC unit for each field."""
+    lists = {
+        name: values.round(_DECIMALS).tolist() for name, values in fields_of(found.air).items()
+    }
+    return {"step": found.step, **lists}
+
+
+def air_from_values(values: dict[str, Any], *, racks: int, units: int, steps: int) -> AirAtStep:
+    """Air that ``air_values`` made plain.
+
+    Args:
+        values: the plain values.
+        racks: racks of the hall.
+        units: CRAC units of the hall.
+        steps: steps of the run.
+
+    Raises:
+        ValueError: values that are missing, out of range or of another number of racks or units.
+    """
+    step = values.get("step")
+    if not isinstance(step, int) or not 0 <= step < steps:
+        raise ValueError(f"step {step!r}; valid is 0..{steps - 1}")
+    arrays = {}
+    for names, count in ((RACK_FIELDS, racks), (UNIT_FIELDS, units)):
+        for name in names:
+            try:
+                array = np.array(values.get(name), dtype=np.float64)
+            except (TypeError, ValueError):
+                array = np.empty(0)
+            if array.shape != (count,) or not np.all(np.abs(array) < _MOST):
+                raise ValueError(f"{name}; valid is a list of {count} numbers")
+            arrays[name] = array
+    return AirAtStep(step, IntakeAir(**arrays))

@@ -23,7 +23,7 @@ from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
-from sdc_taichi.sim.snapshot import LAST_START, state_limits
+from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.sim.stages import Stages, make_stages
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
@@ -257,13 +257,12 @@ class Simulator:
         Raises:
             SdcError: The snapshot is of another version or fleet, incomplete, or not valid.
         """
-        sizing = self.sizing
         inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
         snapshot.check_origin(values, self.fingerprint(inputs))
         like = self._state
         if like is None:
             like = self._initial_state(np.zeros(self.size, dtype=np.int64), inputs)
-        return snapshot.to_state(values, like, lambda step: state_limits(self.fleet, sizing, step))
+        return snapshot.to_state(values, like)
 
     def continue_from(self, state: State | None, drivers: Drivers | None = None) -> None:
         """Continue from a state of this simulator; None is that before the first ``reset``.

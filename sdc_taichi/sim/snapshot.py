@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,8 @@ import numpy.typing as npt
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError, shortened
 from sdc_taichi.hall.protection import NORMAL, TRIPPED
-from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
 from sdc_taichi.sim.drivers import Drivers, common_digits
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
-from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.step_inputs import MOST_MOVES
 from sdc_taichi.types import State, fields_of
 from sdc_taichi.user_file import ArrayFile, open_input
@@ -28,65 +25,21 @@ MOST_STEPS = 10**9
 """Most steps since reset: 1,900 years of minutes."""
 LAST_START = 2**53
 """Latest first step: beyond, steps would not be exact as f64."""
-HALL_LIMITS_C = (-273.15, 1e6)
-"""Limits of temperatures within a rack, in C: absolute zero, and more than a failing fan lets its
-servers reach before the means of the hall leave ``AIR_LIMITS_C``."""
-AIRFLOW_FACTOR = 100.0
-"""Limit of airflows over those at the design point: fans reach a few times their speed there."""
-ROUNDING = 1e-5
-"""What rounding may add to a limit, as a share of it: sized devices and results in f32 differ by
-less between processors."""
-ROUNDING_KWH = 1e-5
-"""What the battery of the released code rounds its store to, 8 decimals of a MWh."""
+LIMITS: dict[str, tuple[float, float]] = {
+    "step": (0, MOST_STEPS),
+    "seed": (0, np.inf),
+    "start": (0, LAST_START),
+    "cooling_run": (0, MOST_STEPS),
+    "cooling_last": (-MOST_MOVES, MOST_MOVES),
+    "fan_speed": (0.0, 1.0),
+    "rack_status": (NORMAL, TRIPPED),
+}
+"""Lowest and highest value of fields of ``State``; all others lie within ``OTHER_LIMITS``.
 
-Limits = tuple[Any, Any]
-"""Lowest and highest value of a field: numbers, or arrays that broadcast to it."""
-
-
-def state_limits(fleet: Fleet, sizing: Sizing, step: int) -> dict[str, Limits]:
-    """Lowest and highest value of each field of ``State`` by name, but for its ``step``.
-
-    Args:
-        fleet: B data centers with R racks, G server groups and U CRAC units.
-        sizing: their sized devices.
-        step: steps done since reset, which limit what can have come together.
-    """
-    per_unit, per_rack = fleet.unit_dc, fleet.rack_dc
-    lowest_c, highest_c = fleet.values("hvac.setpoint.min_c"), fleet.values("hvac.setpoint.max_c")
-    # No more than all work that has arrived can wait, and no more than the queue holds.
-    limit_steps = fleet.values("workload.queue_limit_h") * fleet.steps_per_hour
-    tasks = np.fmin(limit_steps, float(step)) * TASKS_PER_STEP
-    spare_kwh = ROUNDING * sizing.battery_kwh + ROUNDING_KWH
-    is_protected = np.array([c.protection.ashrae_class is not None for c in fleet.configs])
-    most_m3s = AIRFLOW_FACTOR * fleet.unit_sums(fleet.unit_design_m3s)
-    strength = 1.0 if fleet.air is None else fleet.air.mix_weights.strength
-    return {
-        "seed": (0, np.inf),
-        "start": (0, LAST_START),
-        "setpoint_c": (lowest_c[per_unit], highest_c[per_unit]),
-        "cooling_run": (0, step),
-        "cooling_last": (-MOST_MOVES, MOST_MOVES),
-        "fan_speed": (fleet.values("hvac.crac.min_flow_ratio")[per_unit], 1.0),
-        "queue": (0.0, (tasks * (1.0 + ROUNDING) + NEGLIGIBLE_TASKS)[:, None]),
-        "stored_kwh": (-spare_kwh, sizing.battery_kwh + spare_kwh),
-        # Heat in the room warms the supply air, and what is missing cools it.
-        "room_heat_kwh": (
-            (AIR_LIMITS_C[0] - highest_c) * sizing.room_kwh_per_k,
-            (AIR_LIMITS_C[1] - lowest_c) * sizing.room_kwh_per_k,
-        ),
-        "restart_wait_min": (0.0, 60.0 * step / fleet.steps_per_hour),
-        "rack_status": (NORMAL, np.where(is_protected, TRIPPED, NORMAL)[per_rack]),
-        "group_inlet_c": HALL_LIMITS_C,
-        "server_c": HALL_LIMITS_C,
-        "mixed_c": HALL_LIMITS_C,
-        "exhaust_c": (HALL_LIMITS_C[0] * strength, HALL_LIMITS_C[1] * strength),
-        "captured_m3s": (0.0, most_m3s[per_rack]),
-        "need_m3s": (0.0, most_m3s[per_unit]),
-        "following": (0.0, most_m3s[per_unit] / np.maximum(fleet.unit_design_m3s, 1e-30)),
-        "supply_excess_k": (AIR_LIMITS_C[0] - AIR_LIMITS_C[1], AIR_LIMITS_C[1] - AIR_LIMITS_C[0]),
-    }
-
-
+A whole file of this simulator holds no other values: these limits catch damaged ones. What lies
+within them and cannot be continued ends in the next step, as a ``PhysicalLimitError``."""
+OTHER_LIMITS = (-1e12, 1e12)
+"""Lowest and highest value of the other fields of ``State``."""
 VERSION = 3
 """Version of what a snapshot holds."""
 
@@ -157,36 +110,20 @@ def check_origin(values: Any, fingerprint: str) -> None:
             raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
 
 
-def to_state(
-    values: Mapping[str, Any], like: State, limits_at: Callable[[int], Mapping[str, Limits]]
-) -> State:
+def to_state(values: Mapping[str, Any], like: State) -> State:
     """The state that a snapshot holds.
 
     Args:
         values: Arrays by name, see ``check_origin``.
         like: State of the simulator that goes on from it, for shapes and types.
-        limits_at: Lowest and highest values of the fields by name, after so many steps.
 
     Raises:
         SdcError: Values of wrong shape, type or range.
     """
-    step = int(_checked("step", values["step"], like.step, (0, MOST_STEPS)))
-    limits = limits_at(step)
-    checked = {
-        name: _checked(name, values[name], model, limits[name])
-        for name, model in fields_of(like).items()
-        if name != "step"
+    fields_checked = {
+        name: _checked(name, values[name], model) for name, model in fields_of(like).items()
     }
-    # The last command is no number before the first step.
-    last = checked["cooling_last"]
-    if np.any(np.isnan(last) != (step == 0)):
-        raise SdcError(
-            f"snapshot: cooling_last is {shortened(last.tolist())} after {step} steps; "
-            "valid is nan before the first step and numbers from then on"
-        )
-    if np.any(np.diff(checked["queue"], axis=1) < -NEGLIGIBLE_TASKS):
-        raise SdcError("snapshot: queue falls from older to newer work; valid never falls")
-    return State(step=step, **checked)
+    return State(**fields_checked | {"step": int(fields_checked["step"])})
 
 
 def write(path: str | os.PathLike[str], values: Mapping[str, Any]) -> None:
@@ -227,23 +164,20 @@ def as_array(label: str, value: Any) -> npt.NDArray[Any]:
     return np.asarray(value)
 
 
-def _checked(name: str, value: Any, like: Any, limits: Limits) -> Any:
+def _checked(name: str, value: Any, like: Any) -> Any:
     """A copy of a field of a state, of the shape, type and range that it must have."""
-    model, given = np.asarray(like), as_array(f"snapshot: {name}", value)
-    if given.shape != model.shape or given.dtype != model.dtype:
+    model, array = np.asarray(like), as_array(f"snapshot: {name}", value)
+    if array.shape != model.shape or array.dtype != model.dtype:
         raise SdcError(
-            f"snapshot: {name} is {given.dtype} {given.shape}, expected {model.dtype} {model.shape}"
+            f"snapshot: {name} is {array.dtype} {array.shape}, expected {model.dtype} {model.shape}"
         )
-    if given.size == 0:
-        return given.copy()
-    low, high = (np.broadcast_to(limit, given.shape) for limit in limits)
-    is_valid = (given >= low) & (given <= high)
+    low, high = LIMITS.get(name, OTHER_LIMITS)
+    is_valid = (array >= low) & (array <= high)
     if name == "cooling_last":
-        is_valid |= np.isnan(given)
+        # There is no last command before the first step.
+        is_valid |= np.isnan(array)
     if not np.all(is_valid):
-        at = np.unravel_index(np.argmin(is_valid), given.shape)
+        at = np.unravel_index(np.argmin(is_valid), array.shape)
         place = f" of entry {', '.join(map(str, at))}" if at else ""
-        raise SdcError(
-            f"snapshot: {name}{place} is {given[at]:.9g}; valid is {low[at]:.9g}..{high[at]:.9g}"
-        )
-    return given.copy()
+        raise SdcError(f"snapshot: {name}{place} is {array[at]:.9g}; valid is {low:g}..{high:g}")
+    return array.copy()
