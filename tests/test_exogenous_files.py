@@ -191,19 +191,9 @@ def test_carbon_repairs_are_counted(tmp_path: Path) -> None:
     assert "24 absent rows interpolated" in series.notes
     assert "3 rows without values interpolated" in series.notes
     assert any(n.startswith("1 rows with under half of the 25 h median") for n in series.notes)
-    assert any(n.startswith("integers written as floats") for n in series.notes) is False
     changed = np.flatnonzero(series.values != clean.values)
     assert changed.size <= 3 + 1 + 24
     assert np.abs(series.values - clean.values).max() < 250.0
-
-
-def test_integers_as_floats_are_noted(tmp_path: Path) -> None:
-    lines = [
-        build.CARBON_HEADER,
-        *(f"{row.split(',')[0]},0.0,0,0,0,5000.0,0,0,0,490" for row in build.carbon_lines()[1:]),
-    ]
-    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0)
-    assert "integers written as floats in 2 columns" in series.notes
 
 
 def test_carbon_oddities_are_warned_of_and_kept(tmp_path: Path) -> None:

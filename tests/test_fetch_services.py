@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,9 @@ from sdc_taichi.exogenous.fetch.download import MOST_DOWNLOAD_BYTES, Patience
 from sdc_taichi.exogenous.fetch.generation import (
     MOST_EIA_ROWS,
     Period,
-    by_column,
     carbon_table,
     eia_rows,
-    generation_of_year,
+    read_generation,
     year_of_requests,
     zone_code,
 )
@@ -333,12 +333,12 @@ def test_odd_rows_are_noted(run: Callable[..., Result]) -> None:
     ("change", "message"),
     [
         (lambda rows: rows.clear(), "no rows, expected a balancing authority"),
-        (lambda rows: rows[3].update({"value-units": "MW"}), "row 4: value-units 'MW'"),
-        (lambda rows: rows[3].update(period="2023-01-01"), "row 4: period '2023-01-01'"),
-        (lambda rows: rows[3].update(period="2023-13-01T00"), "row 4: period"),
-        (lambda rows: rows[3].update(period="2022-12-31T23"), "row 4: period"),
-        (lambda rows: rows[3].update(value="many"), "row 4: value: 'many'"),
-        (lambda rows: rows[3].pop("fueltype"), "no fueltype"),
+        (lambda rows: rows[3].update({"value-units": "MW"}), "row 4, column value-units: 'MW'"),
+        (lambda rows: rows[3].update(period="2023-01-01"), "row 4, column period: '2023-01-01'"),
+        (lambda rows: rows[3].update(period="2023-13-01T00"), "row 4, column period"),
+        (lambda rows: rows[3].update(period="2022-12-31T23"), "row 4, column period"),
+        (lambda rows: rows[3].update(value="many"), "row 4, column value: 'many'"),
+        (lambda rows: rows[3].pop("fueltype"), "row 4, column fueltype"),
     ],
 )
 def test_wrong_rows_are_one_line(
@@ -358,11 +358,11 @@ def test_requests_cover_the_year_without_too_many_rows() -> None:
     service = services()["eia-930"]
     for year in (2023, 2024):
         periods = year_of_requests(service, "PJM", year).periods
-        assert periods[0].first == 0
-        assert [p.first for p in periods[1:]] == [p.stop for p in periods[:-1]]
-        assert periods[-1].stop == 24 * (366 if year == 2024 else 365)
-        sources = len(service.types)
-        assert max(p.stop - p.first for p in periods) * sources <= MOST_EIA_ROWS
+        hours = np.concatenate([period.hours() for period in periods])
+        expected = pd.date_range(f"{year}-01-01", f"{year + 1}-01-01", freq="h", inclusive="left")
+        np.testing.assert_array_equal(hours, expected)
+        longest = max(len(period.hours()) for period in periods)
+        assert longest * len(service.types) <= MOST_EIA_ROWS
 
 
 @pytest.mark.parametrize(
@@ -433,11 +433,9 @@ def test_generation_per_type_becomes_carbon_intensity(
 DAY = ("2024-01-01T00:00Z", "2024-01-02T00:00Z")
 
 
-def of_first_day(*series: str) -> dict[str, np.ndarray]:
-    found = generation_of_year(
-        services()["entsoe"], 2024, [(Period(0, 24), entsoe_document(*series), "url")]
-    )
-    return {name: values[:24] for name, values in found.items()}
+def of_first_day(*series: str) -> pd.DataFrame:
+    period = Period(date(2024, 1, 1), date(2024, 1, 2))
+    return read_generation(services()["entsoe"], period, entsoe_document(*series), "url")
 
 
 def test_points_that_repeat_are_left_out_in_one_curve_alone() -> None:
@@ -458,11 +456,7 @@ def test_power_is_averaged_to_hours(resolution: str, per_hour: int) -> None:
 
 def test_an_answer_beyond_its_period_is_cut() -> None:
     series = entsoe_series("B04", "2023-12-31T12:00Z", "2024-01-03T00:00Z", [(1, 5.0)], curve="A03")
-    found = generation_of_year(
-        services()["entsoe"], 2024, [(Period(0, 24), entsoe_document(series), "url")]
-    )["B04"]
-    np.testing.assert_array_equal(found[:24], 5.0)
-    assert np.isnan(found[24:]).all()
+    np.testing.assert_array_equal(of_first_day(series)["B04"], np.full(24, 5.0))
 
 
 BOMB = (
@@ -488,7 +482,10 @@ BOMB = (
         (entsoe_document(entsoe_series("B04", *DAY, [(1, np.inf)])), "quantity 'inf'"),
         (entsoe_document(entsoe_series("B04", *DAY[::-1], [])), "expected whole intervals"),
         (entsoe_document(entsoe_series("B04", "soon", DAY[1], [])), "time 'soon'"),
-        (entsoe_document(entsoe_series("B04", "2024-02-31T00:00Z", DAY[1], [])), "calendar"),
+        (
+            entsoe_document(entsoe_series("B04", "2024-02-31T00:00Z", DAY[1], [])),
+            "time '2024-02-31",
+        ),
         (entsoe_document("<TimeSeries/>"), "no quantity_Measure_Unit.name"),
     ],
 )
@@ -554,35 +551,39 @@ def test_bad_options_of_electricity_maps(
 # Generation
 
 
+def hourly(by_type: dict[str, np.ndarray]) -> pd.DataFrame:
+    length = len(next(iter(by_type.values())))
+    return pd.DataFrame(by_type, pd.date_range("2023-01-01", periods=length, freq="h"))
+
+
 def test_storage_is_left_out_and_unreported_time_is_no_gap() -> None:
-    periods = [Period(0, 2), Period(2, 4)]
     by_type = {
         "NG": np.array([1.0, 2.0, 3.0, np.nan]),
         "GEO": np.array([np.nan, np.nan, 5.0, 5.0]),
         "BAT": np.full(4, 9.0),
     }
-    values, notes = by_column(by_type, services()["eia-930"], periods)
-    gas, other = (values[:, FUELS.index(fuel)] for fuel in ("NG", "OTH"))
-    np.testing.assert_array_equal(gas[:3], [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(other[:3], [0.0, 0.0, 5.0])
-    assert np.isnan(gas[3])
+    whole = hourly(by_type)
+    content, notes = carbon_table([whole[:2], whole[2:]], services()["eia-930"])
+    assert content.decode().splitlines() == [
+        f"timestamp,{','.join(FUELS)},avg_CI",
+        "2023-01-01 00:00:00+00:00,0,0,0,0,1,0,0,0,490.000",
+        "2023-01-01 01:00:00+00:00,0,0,0,0,2,0,0,0,490.000",
+        "2023-01-01 02:00:00+00:00,0,0,0,0,3,0,0,5,327.500",
+        "2023-01-01 03:00:00+00:00,0,0,0,0,,0,0,5,",
+    ]
     assert notes == [
         "BAT (storage) left out",
         "GEO counts as OTH",
         "GEO is not reported for 2 h, which count as 0",
     ]
-    rows = carbon_table(np.datetime64("2023-01-01"), values).decode().splitlines()
-    assert rows[0].split(",")[0] == "timestamp"
-    assert rows[1].startswith("2023-01-01 00:00:00+00:00,")
-    assert rows[4] == "2023-01-01 03:00:00+00:00,0,0,0,0,,0,0,5,"
 
 
 def test_short_gaps_and_gaps_within_stay_missing() -> None:
     gas = np.full(1000, 5.0)
     gas[:24] = gas[-25:] = gas[300:400] = np.nan
     by_type = {"NG": gas, "COL": np.full(1000, 1.0)}
-    values, notes = by_column(by_type, services()["eia-930"], [Period(0, 1000)])
-    found = values[:, FUELS.index("NG")]
+    content, notes = carbon_table([hourly(by_type)], services()["eia-930"])
+    found = pd.read_csv(io.BytesIO(content))["NG"].to_numpy()
     assert np.isnan(found[:24]).all()
     assert np.isnan(found[300:400]).all()
     np.testing.assert_array_equal(found[-25:], 0.0)

@@ -52,12 +52,22 @@ class _Commands(typer.core.TyperGroup):
         try:
             with warnings_in_lines():
                 code = super().main(args, *more, **extra)
-            sys.stdout.flush()
         except Exception as error:
             if "--debug" in words:
                 traceback.print_exc()
             code = _print_error(error)
         sys.exit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+        except BrokenPipeError:  # Click would end the program with code 1.
+            if not _is_reader_gone():
+                raise
+            _drop_output()
+            return 0
+        return result
 
 
 app = CommandApp(
@@ -124,9 +134,6 @@ def _print_error(error: Exception) -> int:
         text, code = error.format_message(), error.exit_code
     elif isinstance(error, SdcError):
         text, code = str(error), EXIT_INPUT
-    elif isinstance(error, BrokenPipeError):  # a reader that wants no more, such as ``head``
-        _drop_output()
-        return EXIT_FAILURE
     elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG):
         _drop_output()
         text, code = f"output cannot be written: {error.strerror}", EXIT_INPUT
@@ -138,6 +145,15 @@ def _print_error(error: Exception) -> int:
     if line := one_line(text):
         print(f"error: {line}", file=sys.stderr)
     return code
+
+
+def _is_reader_gone() -> bool:
+    """Whether the reader of standard output, such as ``head``, has ended before the output did."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return True
+    return False
 
 
 def _drop_output() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +14,13 @@ from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.columns import ColumnMap, column_map
 from sdc_taichi.exogenous.series import FloatArray, Series
-from sdc_taichi.exogenous.stamps import HAS_OFFSET, Stamp, by_start_of_interval, region_notes
+from sdc_taichi.exogenous.series_file import Quantity
+from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_notes
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Pairing = Literal["local", "utc_rows"]
 """Whether rows are moved to local time, or kept as if UTC were local time."""
 
-COLUMNS = ("timestamp", *FUELS, "avg_CI")
-"""Columns of a carbon table with its fuel mix."""
 MAX_CI_G_PER_KWH = 2000.0
 """Highest valid carbon intensity, in g/kWh."""
 MIX_TOLERANCE_G = 1.0
@@ -82,17 +78,18 @@ def read_carbon(
         metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata, utc_offset_h, pairing)
-    minutes, start_utc, known, values, notes = _generation(path, columns)
-    intensity = values[:, -1]
-    local = start_utc + np.timedelta64(round(utc_offset_h * 3600), "s")
+    generation = _read_generation(path, columns)
+    minutes, notes, intensity = generation.minutes, generation.notes, generation.values[:, -1]
     if pairing == "utc_rows":
-        local = start_utc
+        local = generation.start_utc
         notes.append("rows kept in UTC order, as the released SustainDC pairs them")
     else:
-        solar = values[:, known.index("SUN")] if "SUN" in known else None
+        local = generation.start_utc + np.timedelta64(round(utc_offset_h * 3600), "s")
+        known = generation.columns
+        solar = generation.values[:, known.index("SUN")] if "SUN" in known else None
         noon_h = 12.0 if longitude_deg is None else 12.0 + utc_offset_h - longitude_deg / 15.0
-        without_leap, _, _ = files.without_leap_days(intensity, local, minutes)
-        files.check_length(path, len(without_leap), minutes)
+        is_leap_day = files.leap_days(len(intensity), local, minutes)
+        files.check_length(path, int((~is_leap_day).sum()), minutes)
         if solar is not None and longitude_deg is not None:
             notes += region_notes(solar, local, minutes, noon_h)
         intensity, shift, note = by_start_of_interval(
@@ -100,48 +97,18 @@ def read_carbon(
         )
         local = local - shift * np.timedelta64(round(minutes * 60), "s")
         notes.append(note)
-    intensity, since, leap_notes = files.without_leap_days(intensity, local, minutes)
-    intensity, year_notes = files.whole_years(path, intensity, since, minutes)
-    notes += leap_notes + year_notes
+    intensity, year_notes = files.calendar_years(path, intensity, local, minutes)
+    notes += year_notes
     return Series(
         intensity, minutes, "ci_g_per_kwh", "g/kWh", path.name, synthetic=False, notes=tuple(notes)
     )
 
 
-def _generation(
-    path: Path, column_names: Mapping[str, str]
-) -> tuple[float, np.datetime64, tuple[str, ...], FloatArray, list[str]]:
-    """Contiguous rows of a carbon table, repaired.
-
-    Returns:
-        Resolution in minutes, first stamp (UTC), names of the columns (fuels if there are any,
-        then ``avg_CI``), values, (T, columns), and notes.
-    """
-    named = column_map(column_names)
-    frame, first_row = files.read_table(path, named.names)
-    notes = named.notes()
-    if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:
-        frame = frame.rename(columns={frame.columns[0]: "timestamp"})
-        notes.append("blank first header read as timestamp")
-    with_fuels = any(fuel in frame.columns for fuel in FUELS)
-    files.require_columns(path, frame, COLUMNS if with_fuels else ("timestamp", "avg_CI"))
-    rows = first_row + np.arange(len(frame))
-    in_utc = "UTC" in named.names.get("timestamp", "")
-    minutes, positions, start_utc = _stamps(path, frame, rows, in_utc=in_utc)
-    columns = (*FUELS, "avg_CI") if with_fuels else ("avg_CI",)
-    values, number_notes = _numbers(path, frame, columns, rows, named)
-    values = files.spread(values, positions)
-    grid_rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
-    values, gap_notes = _repair(path, values, minutes, columns, grid_rows, len(frame))
-    return minutes, start_utc, columns, values, notes + number_notes + gap_notes
-
-
 def _read_imported(
     path: Path, metadata: dict[str, object], utc_offset_h: float, pairing: Pairing
 ) -> Series:
-    kind = series_file.metadata_value(path, metadata, "kind", str)
-    if kind != "carbon":
-        raise DataError(f"{path}: metadata kind: {shortened(kind)}, expected 'carbon'")
+    limits = Quantity("g/kWh", 0.0, MAX_CI_G_PER_KWH)
+    series = series_file.read_series(path, metadata, "carbon", {"ci_g_per_kwh": limits})
     offset = series_file.metadata_value(path, metadata, "utc_offset_h", float)
     if offset != utc_offset_h:
         raise DataError(
@@ -151,61 +118,56 @@ def _read_imported(
         raise DataError(
             f"{path}: metadata pairing: {shortened(metadata['pairing'])}, expected {pairing!r}"
         )
-    minutes = series_file.metadata_value(path, metadata, "minutes", float)
-    columns = series_file.read_columns(path, {"ci_g_per_kwh": (0.0, MAX_CI_G_PER_KWH)}, minutes)
-    return series_file.imported_series(path, metadata, "ci_g_per_kwh", "g/kWh", columns, minutes)
+    return series["ci_g_per_kwh"]
 
 
-def _stamps(
-    path: Path, frame: pd.DataFrame, rows: NDArray[np.int64], *, in_utc: bool
-) -> tuple[float, NDArray[np.int64], np.datetime64]:
-    """Resolution, grid positions and first stamp (UTC) of the timestamp column.
+class _Generation(NamedTuple):
+    """Contiguous rows of a carbon table, repaired."""
 
-    Args:
-        path: file, for messages.
-        frame: the table, as text.
-        rows: rows of the file, for messages, (T,).
-        in_utc: whether stamps without an offset are in UTC.
-    """
-    import pandas as pd
+    minutes: float
+    """Resolution, in minutes."""
+    start_utc: np.datetime64
+    """First stamp, in UTC."""
+    columns: tuple[str, ...]
+    """Names of the columns: fuels if there are any, then ``avg_CI``."""
+    values: FloatArray
+    """Generation and intensity, (T, columns)."""
+    notes: list[str]
+    """Repairs and warnings."""
 
-    text = frame["timestamp"].str.strip()
-    parsed = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
-    bad = parsed.isna().to_numpy()
-    if bad.any():
-        at = int(np.argmax(bad))
-        valid = "a time such as 2022-01-01 00:00:00+00:00"
-        raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
-    naive = ~text.str.contains(HAS_OFFSET, regex=True).to_numpy(dtype=bool)
-    if naive.any() and not in_utc:
-        at = int(np.argmax(naive))
-        valid = "a UTC offset at the end, such as +00:00"
-        raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
-    stamps = parsed.dt.tz_localize(None).to_numpy().astype("datetime64[s]")
-    minutes, positions = files.grid_of_stamps(path, stamps, rows, "timestamp")
-    return minutes, positions, stamps[0]
+
+def _read_generation(path: Path, column_names: Mapping[str, str]) -> _Generation:
+    """Read a carbon table, its columns named as of ``read_carbon``."""
+    named = column_map(column_names)
+    table = files.read_table(path, named.names)
+    notes = named.notes()
+    first_column = table.frame.columns[0]
+    if "timestamp" not in table.frame.columns and first_column.strip() in files.BLANK_HEADERS:
+        table = files.Table(path, table.frame.rename(columns={first_column: "timestamp"}))
+        notes.append("blank first header read as timestamp")
+    with_fuels = any(fuel in table.frame.columns for fuel in FUELS)
+    columns = (*FUELS, "avg_CI") if with_fuels else ("avg_CI",)
+    table.require_columns("timestamp", *columns)
+    stamps, has_offset = table.stamps("timestamp")
+    table.refuse("timestamp", np.isnat(stamps), "a time such as 2022-01-01 00:00:00+00:00")
+    if "UTC" not in named.names.get("timestamp", ""):
+        table.refuse("timestamp", ~has_offset, "a UTC offset at the end, such as +00:00")
+    minutes, positions = files.grid_of_stamps(table, stamps, "timestamp")
+    values, number_notes = _numbers(table, columns, named)
+    values, rows, absent_notes = table.spread(values, positions)
+    values, gap_notes = _repair(path, values, minutes, columns, rows, len(table.frame))
+    notes += number_notes + absent_notes + gap_notes
+    return _Generation(minutes, stamps[0], columns, values, notes)
 
 
 def _numbers(
-    path: Path,
-    frame: pd.DataFrame,
-    columns: tuple[str, ...],
-    rows: NDArray[np.int64],
-    named: ColumnMap,
+    table: files.Table, columns: tuple[str, ...], named: ColumnMap
 ) -> tuple[FloatArray, list[str]]:
-    """Generation and intensity, checked against each other; shape (T, columns)."""
-    notes = []
+    """Generation and intensity, checked against each other, (T, columns), and notes."""
+    highest = dict.fromkeys(FUELS, _MAX_GENERATION_MWH) | {"avg_CI": MAX_CI_G_PER_KWH}
     values = np.stack(
         [
-            files.numbers(
-                path,
-                frame[column],
-                column,
-                rows,
-                0.0,
-                MAX_CI_G_PER_KWH if column == "avg_CI" else _MAX_GENERATION_MWH,
-                unit=named.unit(column),
-            )
+            table.numbers(column, 0.0, highest[column], unit=named.unit(column))
             for column in columns
         ],
         axis=1,
@@ -213,32 +175,19 @@ def _numbers(
     # A grid of renewables alone has 0 all year.
     if not np.isnan(values[:, -1]).all() and 0.0 < np.nanmax(values[:, -1]) < 2.0:
         raise DataError(
-            f"{path}: row {int(rows[0])}, column avg_CI: at most {np.nanmax(values[:, -1]):g} in "
-            "all rows, expected g/kWh (kg/kWh are read with --map avg_CI:kg/kWh=COLUMN)"
+            f"{table.path}: row {table.frame.index[0]}, column avg_CI: at most "
+            f"{np.nanmax(values[:, -1]):g} in all rows, expected g/kWh (kg/kWh are read with "
+            "--map avg_CI:kg/kWh=COLUMN)"
         )
     if len(columns) == 1:
         return values, ["no fuel mix to check avg_CI against"]
     total = values[:, :-1].sum(axis=1)
-    empty = total == 0.0
-    if empty.any():
-        at = int(np.argmax(empty))
-        raise files.fault(path, int(rows[at]), "WND..OTH", 0.0, "some generation")
+    table.refuse("WND..OTH", total == 0.0, "some generation", value=0.0)
     mix = values[:, :-1] @ np.array([emission_factors()[fuel] for fuel in FUELS]) / total
     off = np.abs(values[:, -1] - mix) > MIX_TOLERANCE_G
-    if off.any():
-        at = int(np.argmax(off))
-        valid = f"{mix[at]:.2f} +- {MIX_TOLERANCE_G:g} from the fuel mix"
-        raise files.fault(path, int(rows[at]), "avg_CI", float(values[at, -1]), valid)
-    as_floats = sum(
-        bool(
-            frame[fuel].str.contains(".", regex=False).any()
-            and np.array_equal(np.nan_to_num(x), np.round(np.nan_to_num(x)))
-        )
-        for fuel, x in zip(columns[:-1], values.T, strict=False)
-    )
-    if as_floats:
-        notes.append(f"integers written as floats in {as_floats} columns")
-    return values, notes
+    valid = f"{mix[np.argmax(off)]:.2f} +- {MIX_TOLERANCE_G:g} from the fuel mix"
+    table.refuse("avg_CI", off, valid)
+    return values, []
 
 
 def _repair(
@@ -249,17 +198,14 @@ def _repair(
     rows: NDArray[np.int64],
     rows_in_file: int,
 ) -> tuple[FloatArray, list[str]]:
-    """Interpolate missing rows and partial hours; shape (T, columns) kept."""
+    """Interpolate missing rows and partial hours, (T, columns), and notes."""
     import pandas as pd
 
     notes = []
-    for i, column in enumerate(columns):  # names the column; below, a row counts as a whole
-        files.fill_gaps(path, values[:, i], minutes, column, rows)
-    absent = len(values) - rows_in_file
+    # Long gaps are refused by their column here; below, a row counts as a whole.
+    files.fill_gaps(path, values, minutes, columns, rows)
     missing = np.isnan(values).any(axis=1)
-    blank = int(missing.sum()) - absent
-    if absent:
-        notes.append(f"{absent} absent rows interpolated")
+    blank = int(missing.sum()) - (len(values) - rows_in_file)
     if blank:
         notes.append(f"{blank} rows without values interpolated")
     values = values.copy()
@@ -280,11 +226,7 @@ def _repair(
             notes.append(
                 f"warning: {int(suspect.sum())} rows with {what} kept (first: row {first})"
             )
-    filled = [
-        files.fill_gaps(path, values[:, i], minutes, column, rows)
-        for i, column in enumerate(columns)
-    ]
-    return np.stack(filled, axis=1), notes
+    return files.fill_gaps(path, values, minutes, columns, rows), notes
 
 
 def _suspicious_rows(

@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.columns import Unit
 from sdc_taichi.exogenous.series import FloatArray
+from sdc_taichi.exogenous.stamps import HAS_OFFSET
 from sdc_taichi.exogenous.year_clock import (
     MINUTES_PER_DAY,
     MINUTES_PER_YEAR,
@@ -45,7 +46,7 @@ NO_UNIT = Unit("")
 _FIRST_BYTES = 4096
 
 
-def fault(path: Path, row: int, column: str, value: object, valid: str) -> DataError:
+def fault(path: Path | str, row: int, column: str, value: object, valid: str) -> DataError:
     """Error that names file, row, column, value and what would be valid."""
     return DataError(f"{path}: row {row}, column {column}: {shortened(value)}, expected {valid}")
 
@@ -70,20 +71,128 @@ def is_parquet(path: Path) -> bool:
         return path.suffix.lower() in {".parquet", ".pq"} or file.read(4) == b"PAR1"
 
 
+class Table(NamedTuple):
+    """A table of text, whose rows are labelled with their numbers in the file."""
+
+    path: Path | str
+    """File or address that the table comes from, for messages."""
+    frame: pd.DataFrame
+    """The cells; the index holds the numbers of the rows."""
+
+    def refuse(self, column: str, wrong: Any, valid: str, value: object = None) -> None:
+        """Raise an error that names the first wrong row, if there is one.
+
+        Args:
+            column: name of the column.
+            wrong: which rows are wrong, (T,).
+            valid: what would be valid.
+            value: value for the message; None is the cell.
+
+        Raises:
+            DataError: a row is wrong.
+        """
+        wrong = np.asarray(wrong, dtype=bool)
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            value = self.frame[column].iloc[at] if value is None else value
+            raise fault(self.path, int(self.frame.index[at]), column, value, valid)
+
+    def require_columns(self, *columns: str) -> None:
+        """Check that the table has columns.
+
+        Raises:
+            DataError: names the missing and the present ones.
+        """
+        names = self.frame.columns
+        missing = [column for column in columns if column not in names]
+        if missing:
+            present = ", ".join(
+                "(blank)" if str(name) in BLANK_HEADERS else str(name)[:48] for name in names[:12]
+            )
+            raise DataError(
+                f"{self.path}: row 1: missing column {', '.join(missing)}; found {present}; "
+                f"expected {', '.join(columns)}{mapping_hint(names)}"
+            )
+
+    def numbers(
+        self, column: str, low: float, high: float, hint: str = "", unit: Unit = NO_UNIT
+    ) -> FloatArray:
+        """A column as numbers; blanks and NaN markers become NaN.
+
+        Args:
+            column: name of the column.
+            low: least valid value.
+            high: greatest valid value.
+            hint: appended to what would be valid.
+            unit: unit of the cells.
+
+        Returns:
+            Numbers in the unit of ``low`` and ``high``, (T,).
+
+        Raises:
+            DataError: text that is no number, or a value outside [low, high].
+        """
+        import pandas as pd
+
+        text = self.frame[column].str.strip()
+        values = unit.convert(np.array(pd.to_numeric(text, errors="coerce"), dtype=np.float64))
+        missing = text.str.lower().isin(MISSING_TEXT).to_numpy(dtype=bool)
+        ends = f"{unit.invert(low):g} to {unit.invert(high):g} {unit.symbol}".rstrip()
+        wrong = ~missing & ~((values >= low) & (values <= high))
+        self.refuse(column, wrong, f"a number from {ends}{hint}")
+        values[missing] = np.nan
+        return values
+
+    def stamps(
+        self, column: str, time_format: str = "ISO8601"
+    ) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
+        """Time stamps of a column, and which of them have a UTC offset.
+
+        Args:
+            column: name of the column.
+            time_format: format of the stamps, as of ``strptime``.
+
+        Returns:
+            Times in UTC, or as they are where there is no offset, (T,), NaT where a cell is no
+            time; and whether each has an offset, (T,).
+        """
+        import pandas as pd
+
+        text = self.frame[column].str.strip()
+        times = pd.to_datetime(text, utc=True, errors="coerce", format=time_format)
+        has_offset = text.str.contains(HAS_OFFSET, regex=True).to_numpy(dtype=bool)
+        return times.dt.tz_localize(None).to_numpy().astype("datetime64[s]"), has_offset
+
+    def spread(
+        self, values: FloatArray, positions: NDArray[np.int64]
+    ) -> tuple[FloatArray, NDArray[np.int64], list[str]]:
+        """Values on a regular grid.
+
+        Args:
+            values: values of the rows, (T, ...).
+            positions: places of the rows on the grid, increasing from 0, (T,).
+
+        Returns:
+            Values, NaN where no row is, (N, ...); the row of the file at or after each place, (N,);
+            and notes.
+        """
+        grid = np.full((int(positions[-1]) + 1, *values.shape[1:]), np.nan)
+        grid[positions] = values
+        at = np.searchsorted(positions, np.arange(len(grid)))
+        absent = len(grid) - len(self.frame)
+        notes = [f"{absent} absent rows interpolated"] if absent else []
+        return grid, self.frame.index.to_numpy()[at], notes
+
+
 # Reading
 
 
-def read_table(
-    path: Path, columns: Mapping[str, str] = MappingProxyType({})
-) -> tuple[pd.DataFrame, int]:
+def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Table:
     """Read a CSV file as text, or a Parquet file that `data import` did not write.
 
     Args:
         path: the file.
-        columns: names that columns get, and their names in the file; the rest keep theirs.
-
-    Returns:
-        The table, all columns as text, and the row number of its first line of data.
+        columns: names that columns get, and their names in the file; the others keep theirs.
 
     Raises:
         DataError: not readable as a table, without rows, or without one of ``columns``.
@@ -103,14 +212,11 @@ def read_table(
         frame = frame.iloc[:-1]
     if frame.empty:
         raise DataError(f"{path}: no rows of data")
-    return _renamed(path, frame, columns), first_row
-
-
-def _renamed(path: Path, frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
-    """The table with columns under the names that they are to have, time stamps first."""
+    frame.index = pd.RangeIndex(first_row, first_row + len(frame))
+    table = Table(path, frame)
     if not columns:
-        return frame
-    require_columns(path, frame, tuple(columns.values()))
+        return table
+    table.require_columns(*columns.values())
     taken = [name for name, column in columns.items() if name in frame.columns and name != column]
     if taken or len(set(columns.values())) < len(columns):
         raise DataError(
@@ -118,7 +224,8 @@ def _renamed(path: Path, frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.
             f"another column of the file has"
         )
     frame = frame.rename(columns={column: name for name, column in columns.items()})
-    return frame[sorted(frame.columns, key=lambda name: name != "timestamp")]
+    # Time stamps first, where the reader of workload looks for them.
+    return Table(path, frame[sorted(frame.columns, key=lambda name: name != "timestamp")])
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
@@ -186,23 +293,6 @@ def read_schema(path: Path) -> pa.Schema:
         return pq.read_schema(file)
 
 
-def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:
-    """Reject a table that lacks columns.
-
-    Raises:
-        DataError: names the missing and the present ones.
-    """
-    missing = [c for c in columns if c not in frame.columns]
-    if missing:
-        present = ", ".join(
-            "(blank)" if str(c) in BLANK_HEADERS else str(c)[:48] for c in frame.columns[:12]
-        )
-        raise DataError(
-            f"{path}: row 1: missing column {', '.join(missing)}; found {present}; "
-            f"expected {', '.join(columns)}{mapping_hint(frame.columns)}"
-        )
-
-
 def mapping_hint(columns: Iterable[object]) -> str:
     """End of a message about columns: how a table of Electricity Maps is imported; else empty.
 
@@ -216,85 +306,45 @@ def mapping_hint(columns: Iterable[object]) -> str:
     return " (a table of Electricity Maps: data import FILE --map electricity-maps)"
 
 
-def numbers(
-    path: Path,
-    text: pd.Series[str],
-    column: str,
-    rows: NDArray[np.int64],
-    low: float,
-    high: float,
-    hint: str = "",
-    unit: Unit = NO_UNIT,
-) -> FloatArray:
-    """A column of text as numbers; blanks and NaN markers become NaN.
-
-    Args:
-        path: file, for messages.
-        text: shape (T,).
-        column: for messages.
-        rows: shape (T,), their rows in the file, for messages.
-        low: least valid value.
-        high: greatest valid value.
-        hint: appended to what would be valid.
-        unit: of the text.
-
-    Returns:
-        Numbers in the unit of ``low`` and ``high``, (T,).
-
-    Raises:
-        DataError: text that is no number, or a value outside [low, high].
-    """
-    import pandas as pd
-
-    text = text.str.strip()
-    values = unit.convert(np.array(pd.to_numeric(text, errors="coerce"), dtype=np.float64))
-    missing = text.str.lower().isin(MISSING_TEXT).to_numpy(dtype=bool)
-    wrong = ~missing & ~((values >= low) & (values <= high))
-    if wrong.any():
-        at = int(np.argmax(wrong))
-        ends = f"{unit.invert(low):g} to {unit.invert(high):g} {unit.symbol}".rstrip()
-        raise fault(path, int(rows[at]), column, text.iloc[at], f"a number from {ends}{hint}")
-    values[missing] = np.nan
-    return values
-
-
 # Gaps and whole years
 
 
 def fill_gaps(
-    path: Path, values: FloatArray, minutes: float, column: str, rows: NDArray[np.int64]
+    path: Path | str,
+    values: FloatArray,
+    minutes: float,
+    columns: Sequence[str],
+    rows: NDArray[np.int64],
 ) -> FloatArray:
     """Interpolate NaN linearly; at an end, the value beside it is kept.
 
     Args:
         path: file, for messages.
-        values: shape (T,).
-        minutes: resolution.
-        column: for messages.
-        rows: shape (T,), row of the file each value came from, for messages.
+        values: values of each column, (T, columns).
+        minutes: resolution, in minutes.
+        columns: names of the columns, for messages.
+        rows: row of the file that each value came from, for messages, (T,).
 
     Raises:
         DataError: a gap longer than 24 h, or no value at all.
     """
-    missing = np.isnan(values)
-    if not missing.any():
-        return values
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        hours = (end - start) * minutes / 60.0
-        if hours > MAX_GAP_H:
-            raise fault(
-                path,
-                int(rows[start]),
-                column,
-                f"{hours:g} h without a value",
-                f"gaps of at most {MAX_GAP_H:g} h",
-            )
-    index = np.arange(values.size)
-    return np.interp(index, index[~missing], values[~missing])
+    filled, index = values.copy(), np.arange(len(values))
+    for column, of_column in zip(columns, filled.T, strict=True):
+        missing = np.isnan(of_column)
+        if not missing.any():
+            continue
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            hours = (end - start) * minutes / 60.0
+            if hours > MAX_GAP_H:
+                gap = f"{hours:g} h without a value"
+                valid = f"gaps of at most {MAX_GAP_H:g} h"
+                raise fault(path, int(rows[start]), column, gap, valid)
+        of_column[missing] = np.interp(index[missing], index[~missing], of_column[~missing])
+    return filled
 
 
-def rows_per_year(path: Path, minutes: float) -> int:
+def rows_per_year(path: Path | str, minutes: float) -> int:
     """Number of intervals in 365 days.
 
     Raises:
@@ -308,7 +358,7 @@ def rows_per_year(path: Path, minutes: float) -> int:
     return round(MINUTES_PER_YEAR / minutes)
 
 
-def check_length(path: Path, n: int, minutes: float) -> None:
+def check_length(path: Path | str, n: int, minutes: float) -> None:
     """Reject files shorter than a year of 365 days (8,760 hourly rows).
 
     Raises:
@@ -322,30 +372,8 @@ def check_length(path: Path, n: int, minutes: float) -> None:
         )
 
 
-def without_leap_days(
-    values: FloatArray, start: np.datetime64, minutes: float
-) -> tuple[FloatArray, float, list[str]]:
-    """Remove 29 February from contiguous values.
-
-    Args:
-        values: shape (T, ...), intervals one after another.
-        start: local start of the first interval.
-        minutes: resolution.
-
-    Returns:
-        The remaining values, the first one's start in minutes since 1 January 00:00 of a 365-day
-        year, and notes.
-    """
-    seconds = np.timedelta64(round(minutes * 60), "s")
-    times = start.astype("datetime64[s]") + seconds * np.arange(len(values))
-    leap = is_leap_day(times)
-    remaining = times[~leap]
-    notes = [f"29 February removed ({int(leap.sum())} rows)"] if leap.any() else []
-    return values[~leap], minutes_into_year(remaining[0]) if remaining.size else 0.0, notes
-
-
 def whole_years(
-    path: Path, values: FloatArray, since_minutes: float, minutes: float
+    path: Path | str, values: FloatArray, since_minutes: float, minutes: float
 ) -> tuple[FloatArray, list[str]]:
     """Cut contiguous values to whole 365-day years and begin them on 1 January at 00:00.
 
@@ -385,25 +413,61 @@ def whole_years(
     return values, notes
 
 
+def calendar_years(
+    path: Path | str, values: FloatArray, start: np.datetime64, minutes: float
+) -> tuple[FloatArray, list[str]]:
+    """Cut contiguous values of the calendar to whole 365-day years, as ``whole_years`` does.
+
+    Args:
+        path: file, for messages.
+        values: values of intervals one after another, (T, ...).
+        start: local start of the first interval.
+        minutes: resolution, in minutes.
+
+    Returns:
+        Values, shape (years * rows per year, ...), and notes.
+
+    Raises:
+        DataError: fewer than 365 days.
+    """
+    leap = leap_days(len(values), start, minutes)
+    first = start + np.timedelta64(round(float(np.argmin(leap)) * minutes * 60), "s")
+    since_minutes = 0.0 if leap.all() else minutes_into_year(first)
+    values, notes = whole_years(path, values[~leap], since_minutes, minutes)
+    return values, [f"29 February removed ({int(leap.sum())} rows)"] * bool(leap.any()) + notes
+
+
+def leap_days(count: int, start: np.datetime64, minutes: float) -> NDArray[np.bool_]:
+    """Which of a number of contiguous intervals begin on 29 February, (count,).
+
+    Args:
+        count: number of intervals.
+        start: local start of the first interval.
+        minutes: resolution, in minutes.
+    """
+    seconds = np.timedelta64(round(minutes * 60), "s")
+    return is_leap_day(start.astype("datetime64[s]") + seconds * np.arange(count))
+
+
 def grid_of_stamps(
-    path: Path, stamps: NDArray[np.datetime64], rows: NDArray[np.int64], column: str
+    table: Table, stamps: NDArray[np.datetime64], column: str
 ) -> tuple[float, NDArray[np.int64]]:
     """Resolution of increasing stamps and the place of each on the regular grid.
 
     Args:
-        path: file, for messages.
-        stamps: shape (T,), datetime64[s].
-        rows: shape (T,), their rows in the file.
-        column: for messages.
+        table: the table.
+        stamps: stamps of its rows, datetime64[s], (T,).
+        column: name of the column of the stamps.
 
     Returns:
-        Resolution in minutes (the most frequent step), and positions, shape (T,), from 0.
+        Resolution in minutes (the most frequent step), and places from 0, (T,).
 
     Raises:
         DataError: stamps repeat, go back, are off the grid, or leave a gap over 24 h.
     """
+    path, rows = table.path, table.frame.index
     if stamps.size < 2:
-        raise DataError(f"{path}: row {int(rows[0])}: 1 row of data, expected 365 days")
+        raise DataError(f"{path}: row {rows[0]}: 1 row of data, expected 365 days")
     steps = np.diff(stamps).astype("timedelta64[s]").astype(np.int64)
     back = steps <= 0
     if back.any():
@@ -423,10 +487,3 @@ def grid_of_stamps(
         raise fault(path, int(rows[at]), column, str(stamps[at]), valid)
     positions = np.concatenate([[0], np.cumsum(steps // step)]).astype(np.int64)
     return step / 60.0, positions
-
-
-def spread(values: FloatArray, positions: NDArray[np.int64]) -> FloatArray:
-    """Put values at positions of a regular grid; what is between is NaN."""
-    out = np.full((int(positions[-1]) + 1, *values.shape[1:]), np.nan)
-    out[positions] = values
-    return out

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from sdc_taichi.errors import DataError, shortened, similar_names
 from sdc_taichi.exogenous import series_file
 from sdc_taichi.exogenous.carbon import Pairing, read_carbon
 from sdc_taichi.exogenous.psychrometrics import standard_pressure_pa
-from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
+from sdc_taichi.exogenous.series import Series, SiteData, Weather
 from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
@@ -212,10 +212,10 @@ def site_from_files(
         DataError: neither file nor base gives a part, or a file is not valid.
     """
     if weather is not None:
-        station = read_epw(weather)
+        station: Weather = read_epw(weather)
         name = name or (base.name if base else Path(weather).stem)
     elif base is not None:
-        station = site_weather(base)
+        station = base
         name = name or base.name
     else:
         raise DataError("weather: no file and no base site, expected one of them")
@@ -236,7 +236,8 @@ def site_from_files(
             intensity = replace(intensity, notes=(*intensity.notes, note))
     else:
         raise DataError("carbon: no file and no base site, expected one of them")
-    return make_site(name, station, intensity)
+    of_weather = {field.name: getattr(station, field.name) for field in fields(Weather)}
+    return SiteData(name=name, ci_g_per_kwh=intensity, **of_weather)
 
 
 def _state(label: str) -> str | None:

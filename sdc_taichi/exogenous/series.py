@@ -140,8 +140,8 @@ class Weather:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class SiteData:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SiteData(Weather):
     """Weather and grid carbon intensity of one site on one clock.
 
     The series may differ in resolution and in length; ``resample`` brings each to the step of a
@@ -149,29 +149,9 @@ class SiteData:
     """
 
     name: str
-    """Name by which configs call the site."""
-    label: str
-    """Place, such as ``Phoenix, Arizona``."""
-    latitude_deg: float
-    """Latitude, in degrees north."""
-    longitude_deg: float
-    """Longitude, in degrees east."""
-    elevation_m: float
-    """Elevation above sea level, in m."""
-    utc_offset_h: float
-    """Local standard time minus UTC, in h."""
-    outdoor_c: Series
-    """Outdoor dry bulb, in C."""
-    wet_bulb_c: Series
-    """Outdoor wet bulb, in C."""
+    """Name by which configurations refer to the site."""
     ci_g_per_kwh: Series
     """Carbon intensity of the grid, in g CO2e/kWh."""
-    relative_humidity_pct: Series | None = None
-    """Relative humidity, in %; None if it is not known."""
-    pressure_pa: Series | None = None
-    """Air pressure at the station, in Pa; None if it is not known."""
-    design: DesignConditions | None = None
-    """Design conditions of the station; None if its file has none."""
 
     @property
     def series(self) -> tuple[Series, ...]:
@@ -189,40 +169,6 @@ class SiteData:
     def synthetic(self) -> bool:
         """Whether any of the three driving series was generated."""
         return any(s.synthetic for s in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh))
-
-
-def make_site(name: str, weather: Weather, ci_g_per_kwh: Series) -> SiteData:
-    """Join a station's weather and a grid's carbon intensity under one name."""
-    return SiteData(
-        name=name,
-        label=weather.label,
-        latitude_deg=weather.latitude_deg,
-        longitude_deg=weather.longitude_deg,
-        elevation_m=weather.elevation_m,
-        utc_offset_h=weather.utc_offset_h,
-        outdoor_c=weather.outdoor_c,
-        wet_bulb_c=weather.wet_bulb_c,
-        ci_g_per_kwh=ci_g_per_kwh,
-        relative_humidity_pct=weather.relative_humidity_pct,
-        pressure_pa=weather.pressure_pa,
-        design=weather.design,
-    )
-
-
-def site_weather(site: SiteData) -> Weather:
-    """The weather part of a site."""
-    return Weather(
-        label=site.label,
-        latitude_deg=site.latitude_deg,
-        longitude_deg=site.longitude_deg,
-        elevation_m=site.elevation_m,
-        utc_offset_h=site.utc_offset_h,
-        outdoor_c=site.outdoor_c,
-        wet_bulb_c=site.wet_bulb_c,
-        relative_humidity_pct=site.relative_humidity_pct,
-        pressure_pa=site.pressure_pa,
-        design=site.design,
-    )
 
 
 def step_minutes(steps_per_hour: int) -> int:

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import DataError, SdcError, shortened
 from sdc_taichi.exogenous.files import check_length, fault, read_arrow, read_schema, rows_per_year
 from sdc_taichi.exogenous.series import FloatArray, Series
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 METADATA_KEY = b"sdc_taichi"
 """Key of the JSON in the metadata of the Parquet schema."""
@@ -78,67 +81,70 @@ def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type
     return kind(value)
 
 
-def read_columns(
-    path: Path, limits: Mapping[str, tuple[float, float]], minutes: float
-) -> dict[str, FloatArray]:
-    """Columns of a Parquet file that `data import` wrote, checked like any other input.
+class Quantity(NamedTuple):
+    """A quantity of a file: its unit and the limits of its values."""
+
+    unit: str
+    """Unit of the values."""
+    low: float
+    """Least valid value."""
+    high: float
+    """Greatest valid value."""
+
+
+def read_series(
+    path: Path, metadata: Mapping[str, Any], kind: str, quantities: Mapping[str, Quantity]
+) -> dict[str, Series]:
+    """Series of a Parquet file that `data import` wrote, checked like any other input.
 
     Args:
         path: the file.
-        limits: column to lowest and highest physical value.
-        minutes: resolution, from the metadata.
+        metadata: metadata of the file.
+        kind: kind of data that is expected: ``weather``, ``carbon`` or ``workload``.
+        quantities: quantities to read, by the names of their columns.
 
     Raises:
-        DataError: a column is missing, not numeric, not finite, out of limits, or shorter than
-            a year.
+        DataError: data of another kind, or a column that is missing, not numeric, not finite,
+            beyond its limits, or shorter than a year.
     """
-    table = read_arrow(path)
-    out = {}
-    for column, (low, high) in limits.items():
-        if column not in table.column_names:
-            present = ", ".join(table.column_names)
-            raise DataError(f"{path}: missing column {column}; found {present}")
-        try:
-            values = np.asarray(table[column].to_numpy(), dtype=np.float64)
-        except (TypeError, ValueError):
-            kind = table.schema.field(column).type
-            raise DataError(f"{path}: column {column}: type {kind}, expected numbers") from None
-        good = (values >= low) & (values <= high)
-        if not good.all():
-            at = int(np.argmin(good))
-            valid = f"a number from {low:g} to {high:g}"
-            raise fault(path, at + 1, column, float(values[at]), valid)
-        check_length(path, values.size, minutes)
-        if values.size % rows_per_year(path, minutes):
-            raise DataError(f"{path}: {values.size} rows, expected whole years of 365 days")
-        out[column] = values
-    return out
-
-
-def imported_series(
-    path: Path,
-    metadata: Mapping[str, Any],
-    column: str,
-    unit: str,
-    columns: Mapping[str, FloatArray],
-    minutes: float,
-) -> Series:
-    """Series of one column of a Parquet file that `data import` wrote, with its provenance."""
+    if (stored := metadata_value(path, metadata, "kind", str)) != kind:
+        raise DataError(f"{path}: metadata kind: {shortened(stored)}, expected {kind!r}")
+    minutes = metadata_value(path, metadata, "minutes", float)
     source = metadata_value(path, metadata, "source_file", str)
     digest = metadata_value(path, metadata, "sha256", str)
-    notes = metadata_value(path, metadata, "notes", list)
+    notes = tuple(str(note) for note in metadata_value(path, metadata, "notes", list))
     if metadata.get("origin") is not None:
         origin = metadata_value(path, metadata, "origin", dict)
         source = f"{origin.get('service')}: {source}"
-    return Series(
-        columns[column],
-        minutes,
-        column,
-        unit,
-        f"{source} (sha256 {digest[:12]})",
-        synthetic=False,
-        notes=tuple(str(note) for note in notes),
-    )
+    source = f"{source} (sha256 {digest[:12]})"
+    table = read_arrow(path)
+    series = {}
+    for name, quantity in quantities.items():
+        values = _column(path, table, name, quantity)
+        check_length(path, values.size, minutes)
+        if values.size % rows_per_year(path, minutes):
+            raise DataError(f"{path}: {values.size} rows, expected whole years of 365 days")
+        series[name] = Series(
+            values, minutes, name, quantity.unit, source, synthetic=False, notes=notes
+        )
+    return series
+
+
+def _column(path: Path, table: pa.Table, name: str, quantity: Quantity) -> FloatArray:
+    """Values of a column, all within the limits of its quantity."""
+    if name not in table.column_names:
+        raise DataError(f"{path}: missing column {name}; found {', '.join(table.column_names)}")
+    try:
+        values = np.asarray(table[name].to_numpy(), dtype=np.float64)
+    except (TypeError, ValueError):
+        kind = table.schema.field(name).type
+        raise DataError(f"{path}: column {name}: type {kind}, expected numbers") from None
+    valid = (values >= quantity.low) & (values <= quantity.high)
+    if not valid.all():
+        at = int(np.argmin(valid))
+        limits = f"a number from {quantity.low:g} to {quantity.high:g}"
+        raise fault(path, at + 1, name, float(values[at]), limits)
+    return values
 
 
 def column_names(path: Path) -> list[str]:

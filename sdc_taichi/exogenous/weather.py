@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,6 @@ from sdc_taichi.exogenous.year_clock import (
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.user_file import MOST_TABLE_BYTES, open_input, read_bytes
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 HEADER_LINES = 8
 """Lines before the first row of data."""
 DATA_COLUMNS = 35
@@ -47,8 +44,6 @@ class _Column(NamedTuple):
 
     name: str
     """Name for messages."""
-    position: int
-    """Place in a row, from 0."""
     limits: tuple[float, float]
     """Least and greatest valid value."""
     missing: float
@@ -58,12 +53,16 @@ class _Column(NamedTuple):
 
 
 _FAHRENHEIT = " C (degrees Fahrenheit taken for C?)"
-_DRY_BULB = _Column("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
+_MONTH, _DAY, _HOUR = "month (column 2)", "day (column 3)", "hour (column 4)"
+_DRY_BULB = _Column("dry bulb (column 7)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
 HUMIDITY_LIMITS_PCT = (0.0, 110.0)
 """Limits of relative humidity, of which 100 % is what air can hold."""
-_DEW_POINT = _Column("dew point (column 8)", 7, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
-_HUMIDITY = _Column("relative humidity (column 9)", 8, HUMIDITY_LIMITS_PCT, 999.0)
-_PRESSURE = _Column("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
+_DEW_POINT = _Column("dew point (column 8)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
+_HUMIDITY = _Column("relative humidity (column 9)", HUMIDITY_LIMITS_PCT, 999.0)
+_PRESSURE = _Column("station pressure (column 10)", PRESSURE_LIMITS_PA, 999_999.0)
+_MEASURED = (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE)
+_COLUMN_NAMES = ["year", _MONTH, _DAY, _HOUR, "minute", "source", *(c.name for c in _MEASURED)]
+"""First columns of a row; the others are not read."""
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns that give the weather; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
@@ -110,34 +109,19 @@ def read_epw(path: str | Path) -> Weather:
     lines = _decoded(read_bytes(path, MOST_TABLE_BYTES, DataError)).splitlines()
     location = _location(path, lines)
     per_hour = _records_per_hour(path, lines)
-    frame = _rows(path, lines)
-    hours, frame, leap_rows = _hours(path, frame)
-    positions = _positions(path, frame, hours, per_hour)
+    hours, table, notes = _hours(_rows(path, lines))
+    positions = _positions(table, hours, per_hour)
     minutes = 60.0 / per_hour
-    notes = [f"29 February removed ({leap_rows} rows)"] if leap_rows else []
-    columns, column_notes = _columns(path, frame)
-    notes += column_notes
-    values = files.spread(columns, positions)
-    absent = len(values) - len(frame)
-    if absent:
-        notes.append(f"{absent} absent rows interpolated")
-    rows = frame.index.to_numpy()
-    rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
-    values = np.stack(
-        [
-            files.fill_gaps(path, values[:, i], minutes, column.name, rows)
-            for i, column in enumerate(_USED)
-        ],
-        axis=1,
-    )
+    columns, column_notes = _columns(table)
+    values, rows, absent_notes = table.spread(columns, positions)
+    names = [column.name for column in _USED]
+    values = files.fill_gaps(path, values, minutes, names, rows)
     values, year_notes = files.whole_years(path, values, float(hours[0]) * 60.0, minutes)
-    notes += year_notes
-    outdoor, humidity, pressure = values.T
-    notes += _pressure_notes(pressure, minutes, location["elevation_m"])
+    air = Air(*values.T)
+    notes += column_notes + absent_notes + year_notes
+    notes += _pressure_notes(air.pressure_pa, minutes, location["elevation_m"])
     design, design_notes = _design_conditions(lines)
-    notes += design_notes
-    air = Air(outdoor, humidity, pressure)
-    return make_weather(path, location, minutes, air, notes, design)
+    return make_weather(path, location, minutes, air, notes + design_notes, design)
 
 
 class Air(NamedTuple):
@@ -310,8 +294,8 @@ def _records_per_hour(path: Path, lines: list[str]) -> int:
     raise files.fault(path, 8, "records per hour", text, "a divisor of 60")
 
 
-def _rows(path: Path, lines: list[str]) -> pd.DataFrame:
-    """Rows of data as text, indexed by their row in the file."""
+def _rows(path: Path, lines: list[str]) -> files.Table:
+    """First columns of the rows of data, by the names of ``_COLUMN_NAMES``."""
     import pandas as pd
 
     data = lines[HEADER_LINES:]
@@ -321,67 +305,60 @@ def _rows(path: Path, lines: list[str]) -> pd.DataFrame:
         raise DataError(f"{path}: row {HEADER_LINES}: no rows of data after the header")
     cells = []
     for at, line in enumerate(data):
-        row = line.split(",", 10)
-        if len(row) < 10:
+        row = line.split(",", len(_COLUMN_NAMES))
+        if len(row) < len(_COLUMN_NAMES):
             raise DataError(
                 f"{path}: row {HEADER_LINES + 1 + at}: {len(row)} columns, "
                 f"expected {DATA_COLUMNS} (at least the first 10)"
             )
-        cells.append(row[:10])
-    first = HEADER_LINES + 1
-    return pd.DataFrame(cells, index=range(first, first + len(cells)), columns=range(10), dtype=str)
+        cells.append(row[: len(_COLUMN_NAMES)])
+    rows = range(HEADER_LINES + 1, HEADER_LINES + 1 + len(cells))
+    return files.Table(path, pd.DataFrame(cells, rows, _COLUMN_NAMES, dtype=str))
 
 
-def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataFrame, int]:
-    """Hour of the 365-day year of each row, (T,), rows without 29 February, and how many it had."""
-    dates, rows = {}, frame.index.to_numpy()
-    for name, at, high in (("month", 1, 12), ("day", 2, 31), ("hour", 3, 24)):
-        column = f"{name} (column {at + 1})"
-        values = files.numbers(path, frame[at], column, rows, 1.0, high)
-        bad = np.isnan(values) | (values != np.round(values))
-        if bad.any():
-            row = int(np.argmax(bad))
-            valid = f"a whole number from 1 to {high}"
-            raise files.fault(path, int(rows[row]), column, frame[at].iloc[row], valid)
-        dates[name] = values.astype(np.int64)
-    month, day, hour = dates["month"], dates["day"], dates["hour"]
+def _hours(table: files.Table) -> tuple[NDArray[np.int64], files.Table, list[str]]:
+    """Hour of the 365-day year of each row, (T,), rows without 29 February, and notes."""
+    dates = []
+    for column, high in ((_MONTH, 12), (_DAY, 31), (_HOUR, 24)):
+        values = table.numbers(column, 1.0, high)
+        wrong = np.isnan(values) | (values != np.round(values))
+        table.refuse(column, wrong, f"a whole number from 1 to {high}")
+        dates.append(values.astype(np.int64))
+    month, day, hour = dates
     leap = (month == 2) & (day == 29)
-    long = day > _DAYS_PER_MONTH[month - 1] + leap
-    if long.any():
-        row = int(np.argmax(long))
-        valid = f"a day of month {month[row]}"
-        raise files.fault(path, int(rows[row]), "day (column 3)", int(day[row]), valid)
+    wrong = day > _DAYS_PER_MONTH[month - 1] + leap
+    table.refuse(_DAY, wrong, f"a day of month {month[np.argmax(wrong)]}")
     of_year = (_FIRST_DAY_OF_MONTH[month - 1] + day - 1) * 24 + hour - 1
-    without_leap_days = frame[~leap]
-    if without_leap_days.empty:
-        raise DataError(f"{path}: row {HEADER_LINES + 1}: only 29 February, expected 365 days")
-    return of_year[~leap], without_leap_days, int(leap.sum())
+    if leap.all():
+        raise DataError(
+            f"{table.path}: row {HEADER_LINES + 1}: only 29 February, expected 365 days"
+        )
+    notes = [f"29 February removed ({int(leap.sum())} rows)"] if leap.any() else []
+    return of_year[~leap], files.Table(table.path, table.frame[~leap]), notes
 
 
-def _positions(
-    path: Path, frame: pd.DataFrame, hours: NDArray[np.int64], per_hour: int
-) -> NDArray[np.int64]:
+def _positions(table: files.Table, hours: NDArray[np.int64], per_hour: int) -> NDArray[np.int64]:
     """Place of each row on a regular grid that begins with the first row, (T,)."""
-    rows = frame.index.to_numpy()
+    rows = table.frame.index.to_numpy()
     starts = np.flatnonzero(np.diff(hours, prepend=hours[0] - 1))
     counts = np.diff(starts, append=hours.size)
     if (counts > per_hour).any():
         row = int(rows[starts[np.argmax(counts > per_hour)] + per_hour])
         raise DataError(
-            f"{path}: row {row}, column hour: repeats the hour above, expected {per_hour} "
+            f"{table.path}: row {row}, column hour: repeats the hour above, expected {per_hour} "
             f"row{'s' if per_hour > 1 else ''} per hour (DATA PERIODS)"
         )
     if (counts < per_hour).any():
         at = int(np.argmax(counts < per_hour))
         raise DataError(
-            f"{path}: row {int(rows[starts[at]])}, column hour: {int(counts[at])} rows in the "
-            f"hour, expected {per_hour} (DATA PERIODS)"
+            f"{table.path}: row {int(rows[starts[at]])}, column hour: {int(counts[at])} rows in "
+            f"the hour, expected {per_hour} (DATA PERIODS)"
         )
     steps = np.diff(hours[starts]) % HOURS_PER_YEAR
     bad = steps - 1 > files.MAX_GAP_H
     if bad.any():
         at = int(np.argmax(bad)) + 1
-        month, day, hour = (frame[i].iloc[starts[at]].strip() for i in (1, 2, 3))
+        month, day, hour = table.frame.iloc[starts[at]][[_MONTH, _DAY, _HOUR]].str.strip()
         back = steps[at - 1] > HOURS_PER_YEAR // 2
         valid = (
             "an hour after the row above"
@@ -389,47 +366,46 @@ def _positions(
             else f"gaps of at most 24 h, not {int(steps[at - 1] - 1)} h"
         )
         stamp = f"month {month} day {day} hour {hour}"
-        raise files.fault(path, int(rows[starts[at]]), "date", stamp, valid)
+        raise files.fault(table.path, int(rows[starts[at]]), "date", stamp, valid)
     hour_position = np.concatenate([[0], np.cumsum(steps)])
     within = np.arange(hours.size) - np.repeat(starts, counts)
     return np.asarray(np.repeat(hour_position, counts) * per_hour + within, dtype=np.int64)
 
 
-def _columns(path: Path, frame: pd.DataFrame) -> tuple[FloatArray, list[str]]:
+def _columns(table: files.Table) -> tuple[FloatArray, list[str]]:
     """Dry bulb, relative humidity and pressure, (T, 3), NaN where missing, and notes."""
-    values, notes, rows = {}, [], frame.index.to_numpy()
-    for column in (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE):
-        text = frame[column.position].str.strip()
-        text = text.mask(_is_code(text, column.missing), "nan")
-        x = files.numbers(path, text, column.name, rows, *column.limits, column.hint)
-        values[column] = x
-        missing = int(np.isnan(x).sum())
+    import pandas as pd
+
+    values, notes = {}, []
+    for column in _MEASURED:
+        # Missing codes are written with any number of decimals.
+        text = table.frame[column.name]
+        is_code = pd.to_numeric(text, errors="coerce") == column.missing
+        known = files.Table(table.path, text.mask(is_code, "nan").to_frame())
+        values[column] = known.numbers(column.name, *column.limits, column.hint)
+        missing = int(np.isnan(values[column]).sum())
         if missing and column in _USED:
             notes.append(f"{missing} missing values of {column.name} interpolated")
-    outdoor, humidity = values[_DRY_BULB], values[_HUMIDITY]
-    check_dew_point(path, _DEW_POINT.name, rows, values[_DEW_POINT], outdoor)
-    values[_HUMIDITY], humidity_notes = capped_humidity(humidity)
+    check_dew_point(table, _DEW_POINT.name, values[_DEW_POINT], values[_DRY_BULB])
+    values[_HUMIDITY], humidity_notes = capped_humidity(values[_HUMIDITY])
     notes += humidity_notes
-    pressure = values[_PRESSURE]
-    known = pressure[~np.isnan(pressure)]
-    if known.size and known.std() < 100.0:
-        notes.append(f"warning: station pressure is nearly constant ({known.mean():.0f} Pa)")
+    known_pa = values[_PRESSURE][~np.isnan(values[_PRESSURE])]
+    if known_pa.size and known_pa.std() < 100.0:
+        notes.append(f"warning: station pressure is nearly constant ({known_pa.mean():.0f} Pa)")
     return np.stack([values[column] for column in _USED], axis=1), notes
 
 
 def check_dew_point(
-    path: Path, column: str, rows: NDArray[np.int64], dew_point_c: FloatArray, outdoor_c: FloatArray
+    table: files.Table, column: str, dew_point_c: FloatArray, outdoor_c: FloatArray
 ) -> None:
-    """Reject a dew point above the dry bulb, (T,) both.
+    """Reject a dew point above the dry bulb, in C, (T,) both.
 
     Raises:
         DataError: names file, row, column and value.
     """
     above = dew_point_c > outdoor_c + _DEW_POINT_SLACK_K
-    if above.any():
-        at = int(np.argmax(above))
-        valid = f"at most the dry bulb of {outdoor_c[at]:g} C (the wet bulb would lie above it)"
-        raise files.fault(path, int(rows[at]), column, float(dew_point_c[at]), valid)
+    dry_bulb = f"{outdoor_c[np.argmax(above)]:g} C"
+    table.refuse(column, above, f"at most the dry bulb of {dry_bulb} (the wet bulb would be above)")
 
 
 def capped_humidity(percent: FloatArray) -> tuple[FloatArray, list[str]]:
@@ -441,45 +417,31 @@ def capped_humidity(percent: FloatArray) -> tuple[FloatArray, list[str]]:
     return np.where(over, 100.0, percent), notes
 
 
-def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:
-    """Where a text column carries the missing code, however many decimals it is written with."""
-    import pandas as pd
-
-    result: pd.Series[bool] = pd.to_numeric(text, errors="coerce") == code
-    return result
+_QUANTITIES = {
+    "outdoor_c": series_file.Quantity("C", *OUTDOOR_LIMITS_C),
+    "wet_bulb_c": series_file.Quantity("C", -100.0, 70.0),
+    "relative_humidity_pct": series_file.Quantity("%", 0.0, 100.0),
+    "pressure_pa": series_file.Quantity("Pa", *PRESSURE_LIMITS_PA),
+}
+"""Quantities of a file of weather that ``data import`` wrote."""
+_PLACE_FIELDS = ("latitude_deg", "longitude_deg", "elevation_m", "utc_offset_h")
 
 
 def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
-    kind = series_file.metadata_value(path, metadata, "kind", str)
-    if kind != "weather":
-        raise DataError(f"{path}: metadata kind: {shortened(kind)}, expected 'weather'")
-    minutes = series_file.metadata_value(path, metadata, "minutes", float)
-    limits = {
-        "outdoor_c": OUTDOOR_LIMITS_C,
-        "wet_bulb_c": (-100.0, 70.0),
-        "relative_humidity_pct": (0.0, 100.0),
-        "pressure_pa": PRESSURE_LIMITS_PA,
-    }
-    columns = series_file.read_columns(path, limits, minutes)
-    above = columns["wet_bulb_c"] > columns["outdoor_c"] + 1e-6
+    series = series_file.read_series(path, metadata, "weather", _QUANTITIES)
+    outdoor_c, wet_bulb = series["outdoor_c"].values, series["wet_bulb_c"].values
+    above = wet_bulb > outdoor_c + 1e-6
     if above.any():
         at = int(np.argmax(above))
-        valid = f"at most the dry bulb of {columns['outdoor_c'][at]:g} C"
-        raise files.fault(path, at + 1, "wet_bulb_c", float(columns["wet_bulb_c"][at]), valid)
-    units = {"outdoor_c": "C", "wet_bulb_c": "C", "relative_humidity_pct": "%", "pressure_pa": "Pa"}
-    series = {
-        name: series_file.imported_series(path, metadata, name, unit, columns, minutes)
-        for name, unit in units.items()
+        valid = f"at most the dry bulb of {outdoor_c[at]:g} C"
+        raise files.fault(path, at + 1, "wet_bulb_c", float(wet_bulb[at]), valid)
+    fields: dict[str, Any] = {
+        name: series_file.metadata_value(path, metadata, name, float) for name in _PLACE_FIELDS
     }
-    return Weather(
-        label=series_file.metadata_value(path, metadata, "label", str),
-        latitude_deg=series_file.metadata_value(path, metadata, "latitude_deg", float),
-        longitude_deg=series_file.metadata_value(path, metadata, "longitude_deg", float),
-        elevation_m=series_file.metadata_value(path, metadata, "elevation_m", float),
-        utc_offset_h=series_file.metadata_value(path, metadata, "utc_offset_h", float),
-        **series,
-        design=_imported_design(path, metadata),
-    )
+    fields |= series
+    label = series_file.metadata_value(path, metadata, "label", str)
+    design = _imported_design(path, metadata)
+    return Weather(label=label, design=design, **fields)
 
 
 def _imported_design(path: Path, metadata: dict[str, Any]) -> DesignConditions | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from sdc_taichi.exogenous.psychrometrics import (
     standard_pressure_pa,
 )
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, FloatArray, Weather
-from sdc_taichi.exogenous.stamps import HAS_OFFSET
 from sdc_taichi.exogenous.weather import (
     HUMIDITY_LIMITS_PCT,
     PRESSURE_LIMITS_PA,
@@ -26,9 +25,6 @@ from sdc_taichi.exogenous.weather import (
     check_dew_point,
     make_weather,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _LIMITS = {
     "dry_bulb": OUTDOOR_LIMITS_C,
@@ -86,34 +82,24 @@ def read_weather_table(
     path = Path(path)
     _check(place)
     named = column_map(columns)
-    frame, first_row = files.read_table(path, named.names)
-    humid = "relative_humidity" if "relative_humidity" in frame.columns else "dew_point"
-    files.require_columns(path, frame, ("timestamp", "dry_bulb", humid))
-    rows = first_row + np.arange(len(frame))
-    stamps = _stamps(path, frame["timestamp"].str.strip(), rows, place.utc_offset_h)
-    minutes, positions = files.grid_of_stamps(path, stamps, rows, "timestamp")
+    table = files.read_table(path, named.names)
+    humid = "relative_humidity" if "relative_humidity" in table.frame.columns else "dew_point"
+    table.require_columns("timestamp", "dry_bulb", humid)
+    stamps = _local_stamps(table, place.utc_offset_h)
+    minutes, positions = files.grid_of_stamps(table, stamps, "timestamp")
     if stamp == "end":
         stamps = stamps - np.timedelta64(round(minutes * 60), "s")
-    read = ["dry_bulb", humid, *(["pressure"] if "pressure" in frame.columns else [])]
-    values, notes = _numbers(path, frame, read, rows, named)
-    values = files.spread(values, positions)
-    if len(values) > len(frame):
-        notes.append(f"{len(values) - len(frame)} absent rows interpolated")
-    at = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
-    filled = [
-        files.fill_gaps(path, column, minutes, name, at)
-        for name, column in zip(read, values.T, strict=True)
-    ]
-    values, since, leap_notes = files.without_leap_days(
-        np.stack(filled, axis=1), stamps[0], minutes
-    )
-    values, year_notes = files.whole_years(path, values, since, minutes)
-    notes += leap_notes + year_notes
+    names = ["dry_bulb", humid, *(["pressure"] if "pressure" in table.frame.columns else [])]
+    values, notes = _numbers(table, names, named)
+    values, rows, absent_notes = table.spread(values, positions)
+    values = files.fill_gaps(path, values, minutes, names, rows)
+    values, year_notes = files.calendar_years(path, values, stamps[0], minutes)
+    notes += absent_notes + year_notes
     outdoor, humidity = values[:, 0], values[:, 1]
     if humid == "dew_point":
-        # Both are rounded, so that it may be slightly above.
+        # Both are rounded, so the dew point may be slightly above the dry bulb.
         humidity = relative_humidity_from_dew_point_pct(outdoor, np.minimum(humidity, outdoor))
-    if "pressure" in read:
+    if "pressure" in names:
         pressure = values[:, 2]
     else:
         pressure = np.full(len(values), float(standard_pressure_pa(place.elevation_m)))
@@ -133,47 +119,33 @@ def _check(place: Place) -> None:
             raise DataError(f"{name}: {value:g}, expected {low:g} to {high:g}")
 
 
-def _stamps(
-    path: Path, text: pd.Series[str], rows: NDArray[np.int64], utc_offset_h: float
-) -> NDArray[np.datetime64]:
+def _local_stamps(table: files.Table, utc_offset_h: float) -> NDArray[np.datetime64]:
     """Stamps in local standard time, (T,)."""
-    import pandas as pd
-
-    parsed = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
-    has_offset = text.str.contains(HAS_OFFSET, regex=True).to_numpy(dtype=bool)
-    wrong = parsed.isna().to_numpy() | (has_offset != has_offset[0])
-    if wrong.any():
-        at = int(np.argmax(wrong))
-        valid = "a time such as 2022-01-01 00:00:00, " + (
-            "with its UTC offset as in the first row"
-            if has_offset[0]
-            else "local standard time, or with a UTC offset in each row"
-        )
-        raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
-    stamps: NDArray[np.datetime64] = parsed.dt.tz_localize(None).to_numpy("datetime64[s]")
+    stamps, has_offset = table.stamps("timestamp")
+    valid = "a time such as 2022-01-01 00:00:00, " + (
+        "with its UTC offset as in the first row"
+        if has_offset[0]
+        else "local standard time, or with a UTC offset in each row"
+    )
+    table.refuse("timestamp", np.isnat(stamps) | (has_offset != has_offset[0]), valid)
     return stamps + np.timedelta64(round(utc_offset_h * 3600) if has_offset[0] else 0, "s")
 
 
 def _numbers(
-    path: Path,
-    frame: pd.DataFrame,
-    read: list[str],
-    rows: NDArray[np.int64],
-    named: ColumnMap,
+    table: files.Table, names: list[str], named: ColumnMap
 ) -> tuple[FloatArray, list[str]]:
     """Columns as numbers in C, % and Pa, (T, columns), and notes."""
     notes = named.notes()
     values = {}
-    for name in read:
+    for name in names:
         unit = named.unit(name)
         hint = _FAHRENHEIT if name == "dry_bulb" and not unit.symbol else ""
-        x = files.numbers(path, frame[name], name, rows, *_LIMITS[name], hint, unit)
-        if blank := int(np.isnan(x).sum()):
+        values[name] = table.numbers(name, *_LIMITS[name], hint, unit)
+        if blank := int(np.isnan(values[name]).sum()):
             notes.append(f"{blank} missing values of {name} interpolated")
-        values[name] = x
     if "dew_point" in values:
-        check_dew_point(path, "dew_point", rows, values["dew_point"], values["dry_bulb"])
+        check_dew_point(table, "dew_point", values["dew_point"], values["dry_bulb"])
     else:
         values["relative_humidity"], capped = capped_humidity(values["relative_humidity"])
         notes += capped
-    return np.stack([values[name] for name in read], axis=1), notes
+    return np.stack([values[name] for name in names], axis=1), notes

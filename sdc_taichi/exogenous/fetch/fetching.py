@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.fetch import weather
@@ -25,9 +23,8 @@ from sdc_taichi.exogenous.fetch.download import (
     write_file,
 )
 from sdc_taichi.exogenous.fetch.generation import (
-    by_column,
     carbon_table,
-    generation_of_year,
+    read_generation,
     year_of_requests,
 )
 from sdc_taichi.exogenous.fetch.services import ELECTRICITY_MAPS_RELEASE, Service, services
@@ -155,12 +152,11 @@ def fetch_generation(
     _check(into, service, year, utc_offset_h)
     code, periods, requested = year_of_requests(service, area, year)
     kept = into.downloads(requested)
-    answers = [
-        (period, answer.content, request.url)
+    parts = [
+        read_generation(service, period, answer.content, request.url)
         for period, answer, request in zip(periods, kept, requested, strict=True)
     ]
-    values, notes = by_column(generation_of_year(service, year, answers), service, periods)
-    table = carbon_table(np.datetime64(f"{year}-01-01"), values)
+    table, notes = carbon_table(parts, service)
     path = write_file(downloads_dir(service, into.data_dir) / f"{code}_{year}.csv", table)
     with into.checking():
         return importing.import_carbon(

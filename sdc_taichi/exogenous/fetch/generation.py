@@ -1,17 +1,18 @@
 """Generation by type of energy, of EIA-930 and ENTSO-E, as tables that ``read_carbon`` reads.
 
 EIA-930 reports MWh of an hour, by balancing authorities of the USA. ENTSO-E (article 16.1.B&C,
-document A75) reports mean power in MW of bidding zones and countries of Europe, over intervals of
+document A75) reports mean power in MW of bidding zones and countries of Europe, in intervals of
 15, 30 or 60 minutes that begin at their stamp, which are averaged to hours. Stamps are in UTC.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
-from collections.abc import Mapping, Sequence
-from datetime import date, timedelta
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from datetime import date, datetime, timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,30 +21,40 @@ from numpy.typing import NDArray
 from sdc_taichi.errors import DataError, shortened, suggestion
 from sdc_taichi.exogenous.fetch.download import Request, read_key
 from sdc_taichi.exogenous.fetch.services import STORAGE, Service, services
-from sdc_taichi.exogenous.files import MAX_GAP_H
+from sdc_taichi.exogenous.files import MAX_GAP_H, Table
 from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 from sdc_taichi.user_file import decoding
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST_EIA_ROWS = 5000
 """Largest number of rows of an answer of EIA-930."""
 _EIA_FIRST_DAYS = (1, 11, 21)
 """Days of a month on which a request to EIA-930 begins: 11 days of 18 sources are 4,752 rows."""
+_STAMP = "%Y-%m-%dT%H:%MZ"
 _RESOLUTION_MIN = {"PT15M": 15, "PT30M": 30, "PT60M": 60, "PT1H": 60}
 _SLOT_MIN = 15
 """Length of the slots that intervals of ENTSO-E are divided into, in minutes."""
-_SLOTS = 60 // _SLOT_MIN
+_MOST_INTERVALS = 366 * 24 * 60 // _SLOT_MIN
 _VARIABLE_BLOCKS = "A03"
 """Curve whose points are left out where the value stays (variable sized block)."""
 
 
 class Period(NamedTuple):
-    """Part of a year that one request covers."""
+    """Days in UTC that one request covers."""
 
-    first: int
-    """First hour, counted from 1 January 00:00 UTC."""
-    stop: int
-    """Hour after the last."""
+    first: date
+    """First day."""
+    stop: date
+    """Day after the last."""
+
+    def hours(self) -> pd.DatetimeIndex:
+        """Beginning of each hour."""
+        import pandas as pd
+
+        return pd.date_range(self.first, self.stop, freq="h", inclusive="left")
 
 
 class YearOfRequests(NamedTuple):
@@ -72,12 +83,10 @@ def year_of_requests(service: Service, area: str, year: int) -> YearOfRequests:
     code = _authority(area) if is_eia else zone_code(area)
     days = _EIA_FIRST_DAYS if is_eia else (1,)
     starts = [date(year, month, day) for month in range(1, 13) for day in days]
-    ends = [*starts[1:], date(year + 1, 1, 1)]
     key = read_key(service)
+    check: Callable[[bytes, str], object] = eia_rows if is_eia else _entsoe_runs
     periods, requests = [], []
-    for start, end in zip(starts, ends, strict=True):
-        first = (start - date(year, 1, 1)).days * 24
-        periods.append(Period(first, first + (end - start).days * 24))
+    for start, stop in zip(starts, [*starts[1:], date(year + 1, 1, 1)], strict=True):
         if is_eia:
             name = f"{code}_{start:%Y-%m-%d}.json"
             query = {
@@ -85,7 +94,7 @@ def year_of_requests(service: Service, area: str, year: int) -> YearOfRequests:
                 "data[0]": "value",
                 "facets[respondent][]": code,
                 "start": f"{start:%Y-%m-%d}T00",
-                "end": f"{end - timedelta(days=1):%Y-%m-%d}T23",
+                "end": f"{stop - timedelta(days=1):%Y-%m-%d}T23",
                 "sort[0][column]": "period",
                 "sort[0][direction]": "asc",
                 "length": str(MOST_EIA_ROWS),
@@ -97,9 +106,9 @@ def year_of_requests(service: Service, area: str, year: int) -> YearOfRequests:
                 "processType": "A16",
                 "in_Domain": code,
                 "periodStart": f"{start:%Y%m%d}0000",
-                "periodEnd": f"{end:%Y%m%d}0000",
+                "periodEnd": f"{stop:%Y%m%d}0000",
             }
-        check = eia_rows if is_eia else _entsoe_runs
+        periods.append(Period(start, stop))
         requests.append(Request(service, service.address, name, query, key, service.by_hand, check))
     return YearOfRequests(code, periods, requests)
 
@@ -131,30 +140,41 @@ def zone_code(zone: str) -> str:
     )
 
 
-def generation_of_year(
-    service: Service, year: int, answers: Sequence[tuple[Period, bytes, str]]
-) -> dict[str, FloatArray]:
-    """Generation of each type in each hour of a calendar year, by stamp.
+def read_generation(service: Service, period: Period, content: bytes, url: str) -> pd.DataFrame:
+    """Generation of each type in each hour of an answer.
 
     Args:
         service: EIA-930 or ENTSO-E.
-        year: calendar year, in UTC.
-        answers: period, content and address of each answer.
+        period: days that were asked for.
+        content: the answer.
+        url: address, for messages.
 
     Returns:
-        MWh in the hour, (T,) for each code of a type; NaN where it is not reported.
+        MWh in the hour by code of the type, indexed by the beginning of the hours in UTC as the
+        service stamps them; NaN where it is not reported.
 
     Raises:
         DataError: names the address, row, field and value of what is wrong.
     """
-    read = _add_eia if service.name == "eia-930" else _add_entsoe
-    start = np.datetime64(f"{year}-01-01", "m")
-    end = np.datetime64(f"{year + 1}-01-01", "m")
-    slots = int((end - start).astype(int)) // _SLOT_MIN
-    by_type: dict[str, FloatArray] = {}
-    for period, content, url in answers:
-        read(by_type, start, slots, period, content, url)
-    return {name: values.reshape(-1, _SLOTS).mean(axis=1) for name, values in by_type.items()}
+    if service.name == "eia-930":
+        return _eia_generation(content, url, period.hours())
+    return _entsoe_generation(content, url, period.hours())
+
+
+def hourly_means(table: pd.DataFrame, hours: pd.DatetimeIndex, minutes: int) -> pd.DataFrame:
+    """Means of each hour of a table; NaN where a part of the hour is missing.
+
+    Args:
+        table: values indexed by stamps that are multiples of ``minutes``.
+        hours: the hours, without gaps.
+        minutes: resolution of the table, a divisor of 60.
+    """
+    import pandas as pd
+
+    slots = pd.date_range(hours[0], periods=len(hours) * (60 // minutes), freq=f"{minutes}min")
+    values = table.reindex(slots).to_numpy(dtype=np.float64)
+    means = values.reshape(len(hours), -1, table.shape[1]).mean(axis=1)
+    return pd.DataFrame(means, hours, table.columns)
 
 
 def eia_rows(content: bytes, url: str) -> list[dict[str, Any]]:
@@ -180,65 +200,37 @@ def eia_rows(content: bytes, url: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _add_eia(
-    by_type: dict[str, FloatArray],
-    start: np.datetime64,
-    slots: int,
-    period: Period,
-    content: bytes,
-    url: str,
-) -> None:
-    """Add the generation of an answer of EIA-930 to that of the year, in slots of an hour."""
-    hours = {
-        str(start.astype("datetime64[h]") + hour): hour for hour in range(period.first, period.stop)
-    }
-    for number, row in enumerate(eia_rows(content, url), 1):
-        unit, stamp, value = (row.get(name) for name in ("value-units", "period", "value"))
-        if unit != "megawatthours":
-            raise DataError(
-                f"{url}: row {number}: value-units {shortened(unit)}, expected 'megawatthours'"
-            )
-        if stamp not in hours:
-            raise DataError(
-                f"{url}: row {number}: period {shortened(stamp)}, expected an hour of the request, "
-                f"such as {next(iter(hours))}"
-            )
-        if "fueltype" not in row:
-            raise DataError(f"{url}: row {number}: no fueltype, expected a code such as SUN")
-        if value is None:
-            continue
-        try:
-            mwh = float(value)
-        except (TypeError, ValueError):
-            mwh = np.nan
-        if not np.isfinite(mwh):
-            raise DataError(f"{url}: row {number}: value: {shortened(value)}, expected a number")
-        first = hours[stamp] * _SLOTS
-        series = by_type.setdefault(str(row["fueltype"]), np.full(slots, np.nan))
-        series[first : first + _SLOTS] = mwh
+def _eia_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.DataFrame:
+    """Hourly generation by type of an answer of EIA-930."""
+    import pandas as pd
+
+    rows = pd.DataFrame(eia_rows(content, url))
+    rows = rows.reindex(columns=["period", "fueltype", "value", "value-units"])
+    rows.index = pd.RangeIndex(1, len(rows) + 1)
+    table = Table(url, rows)
+    table.refuse("value-units", rows["value-units"] != "megawatthours", "'megawatthours'")
+    stamps = pd.to_datetime(rows["period"].astype(str), format="%Y-%m-%dT%H", errors="coerce")
+    valid = f"an hour of the request, such as {hours[0]:%Y-%m-%dT%H}"
+    table.refuse("period", ~stamps.isin(hours), valid)
+    table.refuse("fueltype", rows["fueltype"].isna(), "a code such as SUN")
+    values = pd.to_numeric(rows["value"], errors="coerce")
+    table.refuse("value", rows["value"].notna() & ~np.isfinite(values), "a number")
+    return values.groupby([stamps, rows["fueltype"].astype(str)]).last().unstack().reindex(hours)
 
 
-def _add_entsoe(
-    by_type: dict[str, FloatArray],
-    start: np.datetime64,
-    slots: int,
-    period: Period,
-    content: bytes,
-    url: str,
-) -> None:
-    """Add the power of an answer of ENTSO-E to that of the year."""
-    for kind, run_start, power in _entsoe_runs(content, url):
-        at = int((run_start - start).astype(int)) // _SLOT_MIN
-        # An answer may hold more than the request; each period has an answer of its own.
-        low = max(at, period.first * _SLOTS)
-        high = min(at + power.size, period.stop * _SLOTS)
-        if low < high:
-            series = by_type.setdefault(kind, np.full(slots, np.nan))
-            part = power[low - at : high - at]
-            series[low:high] = np.where(np.isnan(part), series[low:high], part)
+def _entsoe_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.DataFrame:
+    """Hourly generation by type of an answer of ENTSO-E, which may hold more hours."""
+    import pandas as pd
+
+    by_type: dict[str, pd.Series[float]] = {}
+    for kind, start, power in _entsoe_runs(content, url):
+        slots = pd.date_range(start, periods=power.size, freq=f"{_SLOT_MIN}min")
+        run = pd.Series(power, slots)
+        by_type[kind] = run.combine_first(by_type[kind]) if kind in by_type else run
+    return hourly_means(pd.DataFrame(by_type), hours, _SLOT_MIN)
 
 
-def _entsoe_runs(content: bytes, url: str) -> list[tuple[str, np.datetime64, FloatArray]]:
+def _entsoe_runs(content: bytes, url: str) -> list[tuple[str, datetime, FloatArray]]:
     """Type, start and mean power in MW, in slots, of each run of intervals of an answer.
 
     What storage consumes is left out.
@@ -272,7 +264,7 @@ def _entsoe_runs(content: bytes, url: str) -> list[tuple[str, np.datetime64, Flo
 
 def _run(
     period: ElementTree.Element, kind: str, *, repeated: bool, url: str
-) -> tuple[np.datetime64, FloatArray]:
+) -> tuple[datetime, FloatArray]:
     """Start and power in MW, in slots, of an element Period."""
     resolution = _text(period, "resolution", url)
     minutes = _RESOLUTION_MIN.get(resolution)
@@ -280,8 +272,8 @@ def _run(
         known = ", ".join(_RESOLUTION_MIN)
         raise DataError(f"{url}: resolution {shortened(resolution)}, expected one of {known}")
     start, end = (_time(_text(period, name, url), url) for name in ("start", "end"))
-    count = int((end - start).astype(int)) // minutes
-    if not 0 < count <= 366 * 24 * _SLOTS or int(start.astype(int)) % _SLOT_MIN:
+    count = (end - start) // timedelta(minutes=minutes)
+    if not 0 < count <= _MOST_INTERVALS or start.minute % _SLOT_MIN:
         raise DataError(f"{url}: a period from {start} to {end}, expected whole intervals")
     power = np.full(count, np.nan)
     for point in period.findall("Point"):
@@ -302,14 +294,11 @@ def _run(
     return start, np.repeat(power, minutes // _SLOT_MIN)
 
 
-def _time(text: str, url: str) -> np.datetime64:
-    """A stamp such as 2024-01-31T23:00Z."""
-    if not re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d(:00)?Z", text):
-        raise DataError(f"{url}: time {shortened(text)}, expected one such as 2024-01-31T23:00Z")
-    try:
-        return np.datetime64(text.removesuffix("Z"), "m")
-    except ValueError:
-        raise DataError(f"{url}: time {shortened(text)}, expected a day of the calendar") from None
+def _time(text: str, url: str) -> datetime:
+    """A time in UTC by its stamp, such as 2024-01-31T23:00Z."""
+    with contextlib.suppress(ValueError):
+        return datetime.strptime(text.replace(":00Z", "Z") if text.count(":") > 1 else text, _STAMP)
+    raise DataError(f"{url}: time {shortened(text)}, expected one such as 2024-01-31T23:00Z")
 
 
 def _text(element: ElementTree.Element, name: str, url: str) -> str:
@@ -320,26 +309,25 @@ def _text(element: ElementTree.Element, name: str, url: str) -> str:
     return text.strip()
 
 
-def by_column(
-    by_type: Mapping[str, FloatArray], service: Service, periods: Sequence[Period]
-) -> tuple[FloatArray, list[str]]:
-    """Generation of the eight columns of a carbon table.
+def carbon_table(parts: Sequence[pd.DataFrame], service: Service) -> tuple[bytes, list[str]]:
+    """A carbon table as CSV, its average intensity by the factors of this package, and notes.
 
     Services leave out what an area does not have, so a type counts as 0 in more than a day before
-    its first and after its last value, and in periods without any value of it. Other hours stay
+    its first and after its last value, and in parts without any value of it. Other hours stay
     missing, for the reader to fill or to refuse.
 
     Args:
-        by_type: generation in each hour of the year, in MWh, (T,) for each type; NaN is missing.
+        parts: contiguous parts of the time, each with the generation of its hours in MWh by type,
+            indexed by stamps in UTC; NaN is missing.
         service: its types and the columns that they count as.
-        periods: parts of the year that were requested one by one.
-
-    Returns:
-        Generation in MWh, (T, 8), NaN where it is missing, and notes.
     """
-    values = np.zeros((periods[-1].stop, len(FUELS)))
+    import pandas as pd
+
+    by_type = pd.concat(parts)
+    lengths = [len(part) for part in parts]
+    values = np.zeros((len(by_type), len(FUELS)))
     notes = []
-    for name, series in sorted(by_type.items()):
+    for name in sorted(by_type.columns):
         column = service.types[name].counts_as if name in service.types else "OTH"
         if name not in service.types:
             notes.append(f"warning: type {name} is not known and counts as OTH")
@@ -348,8 +336,8 @@ def by_column(
             continue
         if column != name:
             notes.append(f"{name} counts as {column}")
-        series = series.copy()
-        absent = _absent(series, periods)
+        series = by_type[name].to_numpy(dtype=np.float64, copy=True)
+        absent = _absent(series, lengths)
         series[absent] = 0.0
         if absent.any():
             notes.append(f"{name} is not reported for {int(absent.sum())} h, which count as 0")
@@ -360,36 +348,30 @@ def by_column(
         values[:, FUELS.index(column)] += series
     # An hour of which nothing at all is known.
     values[~(np.nansum(values, axis=1) > 0.0)] = np.nan
-    return values, notes
+    factors = np.array([emission_factors()[fuel] for fuel in FUELS])
+    intensity = values @ factors / values.sum(axis=1)
+    lines = [",".join(("timestamp", *FUELS, "avg_CI"))]
+    for stamp, row, average in zip(by_type.index, values.tolist(), intensity, strict=True):
+        cells = ["" if np.isnan(x) else f"{x:.6g}" for x in row]
+        cells.append("" if np.isnan(average) else f"{average:.3f}")
+        lines.append(f"{stamp:%Y-%m-%d %H:%M:%S}+00:00,{','.join(cells)}")
+    return ("\n".join(lines) + "\n").encode(), notes
 
 
-def _absent(series: FloatArray, periods: Sequence[Period]) -> NDArray[np.bool_]:
-    """Hours in which a type of energy is not reported rather than missing, (T,)."""
+def _absent(series: FloatArray, lengths: Sequence[int]) -> NDArray[np.bool_]:
+    """Hours in which a type of energy is not reported rather than missing, (T,).
+
+    Args:
+        series: generation of the type, (T,).
+        lengths: number of hours of each part.
+    """
     missing = np.isnan(series)
     absent = np.zeros(missing.size, dtype=bool)
     known = np.flatnonzero(~missing)
     ends = (known[0], known[-1] + 1) if known.size else (missing.size, missing.size)
     for edge in (slice(0, ends[0]), slice(ends[1], None)):
         absent[edge] = absent[edge].size > MAX_GAP_H
-    for first, stop in periods:
-        if missing[first:stop].all():
-            absent[first:stop] = True
+    for part in np.split(np.arange(missing.size), np.cumsum(lengths)[:-1]):
+        if missing[part].all():
+            absent[part] = True
     return absent
-
-
-def carbon_table(start: np.datetime64, values: FloatArray) -> bytes:
-    """A carbon table as CSV, with the average intensity by the factors of this package.
-
-    Args:
-        start: first hour, in UTC.
-        values: generation of each hour in MWh, (T, 8), NaN where it is missing.
-    """
-    factors = np.array([emission_factors()[fuel] for fuel in FUELS])
-    intensity = values @ factors / values.sum(axis=1)
-    stamps = start.astype("datetime64[h]") + np.arange(len(values))
-    lines = [",".join(("timestamp", *FUELS, "avg_CI"))]
-    for stamp, row, average in zip(stamps.tolist(), values.tolist(), intensity, strict=True):
-        cells = ["" if np.isnan(x) else f"{x:.6g}" for x in row]
-        cells.append("" if np.isnan(average) else f"{average:.3f}")
-        lines.append(f"{stamp:%Y-%m-%d %H:%M:%S}+00:00,{','.join(cells)}")
-    return ("\n".join(lines) + "\n").encode()
