@@ -31,7 +31,6 @@ from sdc_taichi import (
 )
 from sdc_taichi.cli.app import app
 from sdc_taichi.config.odd_values import odd_values
-from sdc_taichi.config.reference import fields_markdown
 from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
@@ -268,12 +267,6 @@ def test_weather_is_one_of_a_place_on_earth() -> None:
         drivers_from_arrays([68.0], *year[1:])
     with pytest.raises(DataError, match=r"ci_g_per_kwh .* is 5000"):
         drivers_from_arrays(*year[:2], [5000.0], year[3])
-
-
-def test_the_table_of_fields_gives_bounds_and_models_their_facts() -> None:
-    made = fields_markdown()
-    assert "| `min_condenser_c` | `12.78` | 0..60 |" in made
-    assert "| `electric_air_cooled` | outdoor air | 3 | any |" in made
 
 
 @pytest.mark.parametrize("bad", [-1, 2.5, True, "3", 10**18])

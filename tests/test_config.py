@@ -36,26 +36,12 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-# --- presets and files --------------------------------------------------------------------------
-
-
 def test_presets_that_come_with_the_package() -> None:
     assert set(preset_names()) >= set(PRESETS)
     assert load_config() == load_config("corrected")
     for name in preset_names():
         assert load_config(name).name == name
         assert load_config(name).description
-
-
-def test_presets_differ_by_the_models_they_name() -> None:
-    released, paper = load_config("sustaindc"), load_config("paper")
-    assert (released.hvac.setpoint.min_c, released.hvac.setpoint.max_c) == (15, 21.6)
-    assert (paper.hvac.setpoint.min_c, paper.hvac.setpoint.max_c) == (16, 23)
-    assert released.workload.model == "tasks"
-    assert released.workload.max_utilisation == 0.9
-    assert released.hall.racks == 20
-    assert released.hvac.total_of == paper.hvac.total_of == ("tower_fan", "chiller")
-    assert load_config("large").hall.racks == 1000
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -112,9 +98,6 @@ def test_configs_are_frozen_and_hashable() -> None:
     with pytest.raises(ValidationError):
         config.hall.rows = 3
     assert len({config, load_config("tiny"), load_config("corrected")}) == 2
-
-
-# --- overrides ----------------------------------------------------------------------------------
 
 
 def test_overrides_of_every_kind() -> None:
@@ -188,9 +171,6 @@ def test_values_that_are_not_valid_are_named(assigned: Any, message: str) -> Non
         with_values(load_config("tiny"), assigned)
 
 
-# --- servers ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -213,7 +193,7 @@ def test_servers_without_airflow_are_refused(changes: list[str]) -> None:
 
 
 @pytest.mark.parametrize("preset", ["corrected", "tiny", "large"])
-@pytest.mark.parametrize("scale", [0.7, 1.6, 5.0])
+@pytest.mark.parametrize("scale", [0.7, 5.0])
 def test_capacity_scales_the_number_of_servers(preset: str, scale: float) -> None:
     config = load_config(preset)
     groups = [g for rack in config.rack_groups() for g in rack]
@@ -233,14 +213,6 @@ def test_capacity_below_one_server_per_group_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"tiny: hall\.capacity_mw 0\.0001 .*valid is at least"):
         config.rack_groups()
 
-
-def test_capacity_without_scaling_keeps_the_racks() -> None:
-    config = load_config("corrected", ["hall.servers_per_rack=[" + ", ".join(["3"] * 19) + ", 8]"])
-    counts = [rack[0].count for rack in config.rack_groups()]
-    assert counts == [3] * 19 + [8]
-
-
-# --- the SustainDC format -----------------------------------------------------------------------
 
 HALL, HVAC, SERVERS = (
     "data_center_configuration",
@@ -300,41 +272,38 @@ def dc_config(folder: Path, values: dict[str, Any]) -> Path:
 
 
 def test_every_value_of_the_sustaindc_format_arrives(tmp_path: Path) -> None:
-    config = load_config(dc_config(tmp_path, sustaindc_values()))
-    hall, servers, hvac = config.hall, config.servers, config.hvac
-    assert config.name == "dc_config"
-    assert (hall.rows, hall.racks_per_row, hall.racks) == (2, 3, 6)
-    assert hall.supply_approach_k == (4.1, 4.2, 4.3, 4.4, 4.5, 9.0)
-    assert hall.return_approach_k == (-1.1, -1.2, -1.3, -1.4, -1.5, -1.6)
-    assert [rack[0].count for rack in config.rack_groups()] == [30] * 6
-    assert (hall.air_density_kg_m3, hall.air_heat_capacity_j_per_kg_k) == (1.2, 1005)
-    assert servers.cpu_power_ratio_lb == (0.02, 0.98)
-    assert servers.cpu_power_ratio_ub == (0.04, 1.01)
-    assert servers.fan_airflow_ratio_lb == (0.02, 0.3)
-    assert servers.fan_airflow_ratio_ub == (0.25, 0.9)
-    assert servers.fan_full_airflow_m3s == 0.05
-    assert servers.fan_reference_ratio == 0.9
-    assert servers.fan_reference_w == 11
-    assert servers.inlet_range_c == (15, 27)
-    pairs = [(rack[0].full_w, rack[0].idle_w) for rack in config.rack_groups()]
-    assert pairs == [(171, 21), (121, 11), (131, 12), (141, 13), (151, 14), (161, 15)]
-    assert hvac.crac.supply_m3s_per_w == 0.00006
-    assert hvac.crac.reference_m3s_per_w == 0.00009
-    assert hvac.crac.released_fan_w == 140
-    assert (hvac.tower.paper_fan_w, hvac.tower.paper_airflow_m3s) == (900, 2.5)
-    assert hvac.pumps.released_chilled_w == pytest.approx(200000 * 0.002 / 0.8)
-    assert hvac.pumps.released_condenser_w == pytest.approx(100000 * 0.003 / 0.6)
-
-
-def test_the_sustaindc_format_starts_from_its_preset(tmp_path: Path) -> None:
     config, preset = load_config(dc_config(tmp_path, sustaindc_values())), load_config("sustaindc")
-    for section in ("workload", "battery", "site", "simulation"):
-        assert getattr(config, section) == getattr(preset, section)
-    assert config.hvac.setpoint == preset.hvac.setpoint
-    assert config.hvac.chiller == preset.hvac.chiller
-    assert config.servers.outlet_model == "released"
-    changed = load_config(dc_config(tmp_path, sustaindc_values()), ["battery.model=paper"])
-    assert changed.battery.model == "paper"
+    arrived = {
+        "name": "dc_config",
+        "description": "read from the SustainDC dc_config.json format",
+        "hall.rows": 2,
+        "hall.racks_per_row": 3,
+        "hall.servers_per_rack": 30,
+        "hall.supply_approach_k": [4.1, 4.2, 4.3, 4.4, 4.5, 9.0],
+        "hall.return_approach_k": [-1.1, -1.2, -1.3, -1.4, -1.5, -1.6],
+        "hall.air_density_kg_m3": 1.2,
+        "hall.air_heat_capacity_j_per_kg_k": 1005,
+        "servers.power_w": sustaindc_values()[SERVERS]["DEFAULT_SERVER_POWER_CHARACTERISTICS"],
+        "servers.cpu_power_ratio_lb": [0.02, 0.98],
+        "servers.cpu_power_ratio_ub": [0.04, 1.01],
+        "servers.fan_airflow_ratio_lb": [0.02, 0.3],
+        "servers.fan_airflow_ratio_ub": [0.25, 0.9],
+        "servers.fan_full_airflow_m3s": 0.05,
+        "servers.fan_reference_ratio": 0.9,
+        "servers.fan_reference_w": 11,
+        "servers.inlet_range_c": [15, 27],
+        "hvac.crac.supply_m3s_per_w": 0.00006,
+        "hvac.crac.reference_m3s_per_w": 0.00009,
+        "hvac.crac.released_fan_w": 140,
+        "hvac.tower.paper_fan_w": 900,
+        "hvac.tower.paper_airflow_m3s": 2.5,
+        "hvac.pumps.released_chilled_w": 200000 * 0.002 / 0.8,
+        "hvac.pumps.released_condenser_w": 100000 * 0.003 / 0.6,
+    }
+    # All else is that of the preset.
+    assert config == with_values(preset, arrived)
+    changed = load_config(dc_config(tmp_path, sustaindc_values()), ["hall.supply_approach_k.5=5"])
+    assert changed.hall.supply_approach_k == (4.1, 4.2, 4.3, 4.4, 4.5, 5)
     assert load_config(written(tmp_path / "back.yaml", config.to_yaml())) == config
 
 

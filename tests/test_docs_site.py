@@ -13,7 +13,6 @@ import pytest
 
 import sdc_taichi
 from sdc_taichi import load_config
-from sdc_taichi.config.reference import fields_markdown
 
 pytestmark = pytest.mark.repo
 
@@ -80,7 +79,9 @@ def test_tables_of_code_stand_in_their_pages(stage: ModuleType, tmp_path: Path) 
         assert all(f"\n| `{name}` |" in text for name in names)
 
 
-def test_every_field_of_a_configuration_has_an_anchor(stage: ModuleType) -> None:
+def test_every_field_of_a_configuration_has_an_anchor(
+    stage: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fields(values: Any, path: str) -> Iterator[str]:
         for name, value in values.items():
             if isinstance(value, dict) and value:
@@ -88,7 +89,13 @@ def test_every_field_of_a_configuration_has_an_anchor(stage: ModuleType) -> None
             else:
                 yield path + name
 
-    text = stage.with_field_anchors(fields_markdown())
+    tables = load("field_tables", monkeypatch)
+    made = tables.fields_markdown()
+    assert "| `min_condenser_c` | `12.78` | 0..60 |" in made
+    assert "| `electric_air_cooled` | outdoor air | 3 | any |" in made
+    text = stage.with_field_anchors(made)
+    assert "| `seeds` |" in tables.suite_markdown()
+    assert "| `gamma` |" in tables.settings_markdown()
     anchors = re.findall(r'id="([^"]+)"', text)
     assert len(anchors) == len(set(anchors))
     named = set(fields(load_config("corrected").model_dump(), ""))

@@ -7,21 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from sdc_taichi import EnvOptions
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.terminal import duration
 from sdc_taichi.errors import SdcError
-from sdc_taichi.learning.algorithms import LEARNING_SETTINGS, OffPolicySettings
+from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.split import TRAINING
 from sdc_taichi.learning.training_settings import (
     SCENARIOS,
     TrainingSettings,
     load_settings,
     make_settings,
-    settings_markdown,
 )
 
 
@@ -151,11 +149,3 @@ def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> N
 
 def test_durations_are_short_texts() -> None:
     assert [duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]
-
-
-def test_the_tables_of_settings_have_all_fields() -> None:
-    tables = settings_markdown()
-    sections: list[type[BaseModel]] = [TrainingSettings, *LEARNING_SETTINGS.values()]
-    for section in sections:
-        for name in section.model_fields.keys() - {"environment", "learning", "validation"}:
-            assert f"| `{name}` |" in tables

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import typer.main
+from field_tables import settings_markdown, suite_markdown
 from stage import write
 
-from sdc_taichi.benchmark.suite import suite_markdown
 from sdc_taichi.cli.app import app
-from sdc_taichi.learning.training_settings import settings_markdown
 from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
 
 FOLDER = "reference/generated"

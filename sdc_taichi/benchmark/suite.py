@@ -17,7 +17,6 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from sdc_taichi.config import load_config, load_yaml, preset_names, validated
 from sdc_taichi.config.fields import Section, Text
-from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.control import ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
@@ -342,18 +341,6 @@ def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
         ConfigError: naming the key, the value and what would be valid.
     """
     return validated(Suite, values, label)
-
-
-def suite_markdown() -> str:
-    """The tables of docs/suites.md, one for each section."""
-    return sections_markdown(
-        [
-            ("", Suite),
-            ("cases.NAME", Case),
-            ("cases.NAME.test", OtherDataCenters),
-            ("rows.NAME", Row),
-        ]
-    )
 
 
 def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def new_command(
     force: Annotated[bool, force_option()] = False,
 ) -> None:
     """Write a configuration to start from, with unit, bounds and meaning above each field."""
-    from sdc_taichi.config.reference import commented_yaml
+    from sdc_taichi.config.field_texts import commented_yaml
 
     check_out_file(out, ".yaml", force=force, option="FILE")
     head = f"# A data center, from preset {preset}. Fields that are left out have defaults.\n\n"

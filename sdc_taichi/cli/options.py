@@ -111,7 +111,7 @@ def completed_by(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str
 
 
 def _presets_and_fields() -> list[str]:
-    from sdc_taichi.config.reference import field_names
+    from sdc_taichi.config.field_texts import field_names
 
     return [*preset_names(), *(f"{name}=" for name in field_names())]
 

@@ -10,12 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C
-from sdc_taichi.number_text import parse_number
 from sdc_taichi.plant.plants import PLANTS
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -104,7 +111,7 @@ Plant = Annotated[str, NameIn(PLANTS)]
 
 
 class Section(BaseModel):
-    """Base of every section: frozen, of finite numbers, and without keys that it does not name."""
+    """Base of every section: frozen, with finite numbers and no unknown keys."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=()
@@ -112,16 +119,11 @@ class Section(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _check_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        # Python takes True for 1, and pydantic the text 1_000 for a thousand.
+    def _no_truth_for_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        # Python takes True for 1.
         assert info.field_name is not None
-        kind = cls.model_fields[info.field_name].annotation
-        if kind is bool:
-            return value
-        if _has_truth(value):
+        if cls.model_fields[info.field_name].annotation is not bool and _has_truth(value):
             raise ValueError("should be a number or text, not true or false")
-        if _has_odd_number(value) and not _takes_text(kind):
-            raise ValueError("should be a finite decimal number, such as 1000 or 1.5e-3")
         return value
 
 
@@ -132,39 +134,14 @@ def _has_truth(value: Any) -> bool:
     return isinstance(value, bool)
 
 
-def _has_odd_number(value: Any) -> bool:
-    """Whether a value is, or a list contains, a text like ``1_000``: a number to Python alone."""
-    if isinstance(value, list | tuple):
-        return any(map(_has_odd_number, value))
-    if not isinstance(value, str):
-        return False
-    try:
-        float(value)
-    except ValueError:
-        return False
-    try:
-        parse_number(value)
-    except ValueError:
-        return True
-    return False
-
-
-def _takes_text(kind: Any) -> bool:
-    """Whether a field of this type accepts text: a string, a choice, or a union with either."""
-    if isinstance(kind, str) or (isinstance(kind, type) and issubclass(kind, str)):
-        return True
-    return any(map(_takes_text, get_args(kind)))
-
-
-def check_ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
-    """A pair unchanged; None passes.
-
-    Raises:
-        ValueError: its first entry is not below its second.
-    """
-    if value is not None and not value[0] < value[1]:
+def _check_ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
         raise ValueError(f"({value[0]:g}, {value[1]:g}) must be (low, high) with low < high")
     return value
+
+
+Ordered = AfterValidator(_check_ordered)
+"""Marks a pair of numbers of which the first is below the second."""
 
 
 def check_one_per_rack(name: str, values: Any, racks: int, *, one_for_all: bool = False) -> None:
@@ -219,7 +196,9 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
         model: the schema that was validated against.
     """
     problems: dict[str, str] = {}
-    for item in error.errors(include_url=False):
+    # An unknown key may be the misspelling of one that is missing.
+    items = error.errors(include_url=False)
+    for item in sorted(items, key=lambda item: item["type"] != "extra_forbidden"):
         *sections, last = item["loc"] or ("",)
         parts = [part for part in sections if not _is_union_branch(part)]
         # The last part of these is a key of the user's, whatever it looks like.

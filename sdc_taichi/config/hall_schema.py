@@ -17,6 +17,7 @@ from sdc_taichi.config.fields import (
     IdleW,
     LengthM,
     Name,
+    Ordered,
     PowerRatio,
     RiseK,
     Section,
@@ -25,7 +26,6 @@ from sdc_taichi.config.fields import (
     Text,
     WorkingShare,
     check_one_per_rack,
-    check_ordered,
 )
 from sdc_taichi.errors import shortened, suggestion_or_valid
 from sdc_taichi.plant.servers import ServerCurves, linear_curve
@@ -251,7 +251,7 @@ class HallConfig(Section):
     supply_approach_k: RiseK | tuple[RiseK, ...]
     """Rack inlet above the CRAC supply at the design point, in K: one for all racks, or one per
     rack."""
-    supply_approach_limits_k: tuple[RiseK, RiseK] | None = None
+    supply_approach_limits_k: Annotated[tuple[RiseK, RiseK], Ordered] | None = None
     """Lowest and highest supply approach, which bound ``supply_approach_k``, in K; None is no
     bounds."""
     return_approach_k: DifferenceK | tuple[DifferenceK, ...]
@@ -343,11 +343,6 @@ class HallConfig(Section):
             )
         return self
 
-    @field_validator("supply_approach_limits_k")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        return check_ordered(value)
-
     @model_validator(mode="after")
     def _every_rack_has_one_type(self) -> Self:
         self.rack_type_names()
@@ -387,7 +382,7 @@ class ServerConfig(Section):
     cpu_slope_offset_per_k: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Addition to the slope of CPU power over full power against the inlet, in 1/K, -1..1: a kelvin
     changes no server's power by more than that at full load."""
-    inlet_range_c: tuple[AirC, AirC] = (16.0, 28.0)
+    inlet_range_c: Annotated[tuple[AirC, AirC], Ordered] = (16.0, 28.0)
     """Coldest and warmest inlet, between which the curves are given, in C; at least 5 K apart, as
     the curves go on as straight lines beyond both."""
     curve_limit_c: AirC | None = 45.0
@@ -402,7 +397,7 @@ class ServerConfig(Section):
     fan_model: Literal["linear", "released"] = "linear"
     """Airflow ratio against inlet temperature and load: as the ratios above give it, or scaled as
     in the released SustainDC."""
-    fan_airflow_ratio_limits: tuple[FlowRatio, FlowRatio] | None = None
+    fan_airflow_ratio_limits: Annotated[tuple[FlowRatio, FlowRatio], Ordered] | None = None
     """Lowest and highest airflow ratio; None bounds the ratio at 0 alone, since fans never blow
     backwards."""
     fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
@@ -475,11 +470,6 @@ class ServerConfig(Section):
             isinstance(x, list | tuple) for x in value
         )
         return [value] if flat else value
-
-    @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        return check_ordered(value)
 
     @field_validator("inlet_range_c")
     @classmethod

@@ -21,8 +21,14 @@ from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 DEFAULT_PRESET = "corrected"
 """Preset that is read where none is named."""
-_EITHER_OF_SERVERS = (("groups", "power_w"), ("fan_reference_w", "fan_reference_share"))
-"""Fields of ``servers`` of which one is given, and the other null."""
+_REPLACES: dict[str, dict[str, Any]] = {
+    "servers.power_w": {"servers.groups": None, "hall.rack_types": {}, "hall.rack_plan": []},
+    "servers.groups": {"servers.power_w": None, "hall.rack_types": {}, "hall.rack_plan": []},
+    "hall.rack_types": {"servers.power_w": None, "servers.groups": None},
+    "servers.fan_reference_w": {"servers.fan_reference_share": None},
+    "servers.fan_reference_share": {"servers.fan_reference_w": None},
+}
+"""Fields that take the place of inherited ones, and what these become then."""
 
 
 def preset_names() -> list[str]:
@@ -119,7 +125,7 @@ def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
 
 
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Label and values of a preset or a file, with what it extends."""
+    """Name and merged values of a preset or file, those that it extends included."""
     if isinstance(source, str) and source in preset_names():
         return _read_preset(source)
     try:
@@ -134,9 +140,9 @@ def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     path = Path(source)
     label = str(path)
     if path.suffix.lower() != ".json":
-        return label, _with_base(label, _parse_yaml(text, label))
-    values = _parse_json(text, label)
-    if sustaindc.SECTIONS[0] in values:
+        return label, _with_base(label, _parse(text, label))
+    values = _parse(text, label, "JSON")
+    if sustaindc.is_of_format(values):
         _, base = _read_preset("sustaindc")
         return label, _merged(base, sustaindc.read(values, label))
     return label, _with_base(label, values)
@@ -150,7 +156,7 @@ def _read_preset(name: str) -> tuple[str, dict[str, Any]]:
 @cache
 def _parse_preset(name: str, label: str) -> dict[str, Any]:
     text = resources.files("sdc_taichi.configs").joinpath(f"{name}.yaml").read_text("utf-8")
-    return _with_base(label, _parse_yaml(text, label))
+    return _with_base(label, _parse(text, label))
 
 
 def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
@@ -164,31 +170,26 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
         )
     _, merged = _read_preset(str(base))
     merged = _merged(merged, values)
-    servers = values.get("servers")
-    if isinstance(servers, dict):
-        _replace_other_servers(merged["servers"], servers)
-    _replace_by_rack_types(merged, values)
+    _replace_excluded(merged, values)
     return merged
 
 
-def _replace_by_rack_types(merged: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Remove inherited servers where a file has types of racks, and types where it has servers."""
-    hall, servers = values.get("hall"), values.get("servers")
-    named = {k for k in ("power_w", "groups") if isinstance(servers, dict) and servers.get(k)}
-    if isinstance(hall, dict) and hall.get("rack_types"):
-        for name in {"power_w", "groups"} - named:
-            merged["servers"][name] = None
-    elif named:
-        merged["hall"].pop("rack_types", None)
-        merged["hall"].pop("rack_plan", None)
-
-
-def _replace_other_servers(servers: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Set an inherited setting to null where a file has the one that excludes it."""
-    for one, other in _EITHER_OF_SERVERS:
-        for new, old in ((one, other), (other, one)):
-            if values.get(new) is not None and old not in values:
-                servers[old] = None
+def _replace_excluded(merged: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Unset inherited fields whose place is taken by fields of ``values``."""
+    given = {
+        f"{section}.{name}": value
+        for section in ("hall", "servers")
+        if isinstance(fields := values.get(section), dict)
+        for name, value in fields.items()
+    }
+    for new, replaced in _REPLACES.items():
+        if given.get(new) in (None, {}):
+            continue
+        for path, unset in replaced.items():
+            section, _, name = path.partition(".")
+            fields = merged.setdefault(section, {})
+            if path not in given and isinstance(fields, dict):
+                fields[name] = unset
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -201,23 +202,12 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _parse_yaml(text: str, label: str) -> dict[str, Any]:
+def _parse(text: str, label: str, kind: str = "YAML") -> dict[str, Any]:
+    """Sections of a YAML or JSON text."""
     try:
-        values = load_yaml(text)
+        values = load_json(text) if kind == "JSON" else load_yaml(text)
     except ValueError as error:
-        raise ConfigError(f"{label}: not valid YAML ({error})") from None
-    return _require_mapping(values, label)
-
-
-def _parse_json(text: str, label: str) -> dict[str, Any]:
-    try:
-        values = load_json(text)
-    except ValueError as error:
-        raise ConfigError(f"{label}: not valid JSON ({error})") from None
-    return _require_mapping(values, label)
-
-
-def _require_mapping(values: Any, label: str) -> dict[str, Any]:
+        raise ConfigError(f"{label}: not valid {kind} ({error})") from None
     if not isinstance(values, dict):
         kind = type(values).__name__
         raise ConfigError(f"{label}: the top level is a {kind}; valid is a mapping of sections")
@@ -263,10 +253,8 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
         node[_list_index(node, last, override)] = value
     else:
         node[last] = value
-        if sections == ["servers"]:
-            _replace_other_servers(node, {last: value})
-        if sections in (["servers"], ["hall"]):
-            _replace_by_rack_types(values, {sections[0]: {last: value}})
+        if len(sections) == 1:
+            _replace_excluded(values, {sections[0]: {last: value}})
 
 
 def _list_index(node: list[Any], key: str, override: str) -> int:

@@ -348,10 +348,3 @@ def _options(options: Any, keywords: Mapping[str, Any], only_agent: str | None) 
                 "sdc_taichi/Joint-v0"
             )
     return make_options(**values)
-
-
-def options_markdown() -> str:
-    """The table of options in docs/environments.md."""
-    from sdc_taichi.config.reference import sections_markdown
-
-    return sections_markdown([("", EnvOptions)]).partition("\n\n|")[2].join(("|", ""))

@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import (
-    BaseModel,
     Field,
     SerializeAsAny,
     field_serializer,
@@ -31,7 +30,6 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.config.fields import Section
-from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
@@ -464,11 +462,3 @@ def _leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from _leaves(name, value)
         else:
             yield name, value
-
-
-def settings_markdown() -> str:
-    """Tables of all settings as Markdown, one for each section."""
-    sections: list[tuple[str, type[BaseModel]]] = [("", TrainingSettings)]
-    sections.append(("validation", ValidationSettings))
-    kinds = dict.fromkeys(LEARNING_SETTINGS.values())
-    return sections_markdown([*sections, *(("learning", kind) for kind in kinds)])
