@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from random_halls import AS_FOUND, SEEDS, fleet_of, random_values
-from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
@@ -86,9 +86,9 @@ def test_any_hall_simulates_what_hall_show_prints(
     assert_at_design(shown, simulated(config, shown.supply_c))
 
 
-@pytest.mark.parametrize("supply_c", [16.0, 18.0, 23.0])
+@pytest.mark.parametrize("supply_c", [16.0, 23.0])
 @pytest.mark.parametrize("units", [1, 4])
-@pytest.mark.parametrize("containment", [0.0, 0.5, 0.7, 0.9, 1.0])
+@pytest.mark.parametrize("containment", [0.0, 0.7, 1.0])
 def test_hottest_inlet_is_continuous_in_load(
     containment: float, units: int, supply_c: float
 ) -> None:
@@ -98,18 +98,6 @@ def test_hottest_inlet_is_continuous_in_load(
     inlets_c = simulated_at(config, supply_c, np.linspace(0.0, 1.0, 401)).inlet_max_c
     # A quarter of a percent of load; without containment inlets rise by 10 K over all of it.
     assert np.max(np.abs(np.diff(inlets_c))) < 0.1
-
-
-@pytest.mark.parametrize("highest_c", [19.0, 23.0, 27.0])
-def test_setpoint_limits_move_neither_temperatures_nor_sizes(highest_c: float) -> None:
-    config = load_config("corrected", [f"hvac.setpoint.max_c={highest_c}"])
-    at_18 = simulated(config, 18.0)
-    expected = simulated(load_config("corrected"), 18.0)
-    np.testing.assert_allclose(at_18.rack_inlet_c, expected.rack_inlet_c, rtol=0, atol=1e-9)
-    with Simulator([config, load_config("corrected", ["name=usual"])]) as sim:
-        for name in ("it_w", "crac_flow_m3s", "facility_w", "battery_kwh"):
-            sized = getattr(sim.sizing, name)
-            assert sized[0] == pytest.approx(sized[1], rel=1e-5)
 
 
 def test_design_supply_air_moves_the_design_point() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sdc_taichi import (
-    ConfigError,
     OddInputWarning,
     Simulator,
     StepResult,
@@ -18,7 +17,6 @@ from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
-from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.sim.step_inputs import UnitIndex
 
@@ -54,13 +52,6 @@ def test_balanced_shares_give_what_units_give() -> None:
     np.testing.assert_allclose(change, change[0], rtol=1e-9)
 
 
-def test_a_rack_with_one_unit_alone_keeps_it() -> None:
-    shares = np.array([[1.0, 0.0], [0.5, 0.5]])
-    found = weighted_shares(shares, unit_weights(shares, np.ones(2), np.array([0.1, 1.0])))
-    assert found[0].tolist() == [1.0, 0.0]
-    assert found[1, 1] > 0.99
-
-
 def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> None:
     fleet, whole = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, steps=2)
     _, lost = run_at_full_load(FOUR, N_PLUS_1, PROTECTED, *MINUTES, LOST, steps=60)
@@ -76,14 +67,6 @@ def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> N
     assert total == pytest.approx(whole[-1].crac_flow_m3s[0], rel=0.03)
     assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.0
     assert all(result.throttled_racks[0] == 0 for result in lost)
-
-
-def test_without_spare_units_the_others_go_to_full_speed() -> None:
-    fleet, lost = run_at_full_load(FOUR, *MINUTES, LOST, steps=40)
-    speed = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
-    np.testing.assert_allclose(speed, [0.1, 1.0, 1.0, 1.0], rtol=1e-9)
-    # The plenum is shared, so no rack has less air than the others of its kind.
-    assert lost[4].inlet_max_c[0] > lost[2].inlet_max_c[0] + 1.0
 
 
 @pytest.mark.parametrize(("flow_model", "takes_over"), [("pressure", True), ("constant", False)])
@@ -142,51 +125,6 @@ def test_units_that_are_far_too_large_run_at_their_lowest_speed(flow_model: str)
     np.testing.assert_allclose(found.rack_inlet_c, shown.inlet_c, rtol=0, atol=1e-6)
 
 
-def test_shares_come_back_with_the_unit() -> None:
-    event = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.5, duration_h: 0.5}]"
-    _, results = run_at_full_load(FOUR, event, steps=12)
-    _, whole = run_at_full_load(FOUR, steps=1)
-    # Heat held by the room is gone by then.
-    assert results[-1].room_heat_kwh[0] < 1e-9
-    np.testing.assert_allclose(results[-1].rack_inlet_c, whole[0].rack_inlet_c, rtol=1e-12)
-
-
-def test_a_large_hall_has_hundreds_of_units() -> None:
-    fleet = build_fleet(load_config("large", ["hvac.crac.units=400"]))
-    assert fleet.units == 400
-    with pytest.raises(ConfigError, match=r"shares of supply air; valid is at most 3,355 units"):
-        build_fleet(load_config("large", ["hall.rows=500", "hvac.crac.units=10000"]))
-
-
-def test_lowest_speed_of_the_fans_costs_a_variable_speed_unit_little() -> None:
-    """Fans with electronically commutated motors follow the load further down than 0.6."""
-    load = np.linspace(0.05, 1.0, 20)[None]
-    outdoor, wet_bulb, carbon = (np.full(load.shape, x) for x in (20.0, 14.0, 300.0))
-    drivers = drivers_from_arrays(outdoor, wet_bulb, carbon, load)
-
-    def fan_w(*overrides: str) -> float:
-        with Simulator(load_config("corrected", list(overrides)), drivers=drivers) as sim:
-            sim.reset()
-            return float(np.mean([sim.step().crac_fan_w[0] for _ in range(20)]))
-
-    free_w = fan_w("hvac.crac.min_flow_ratio=0.01")
-    assert fan_w() == pytest.approx(free_w, rel=0.02)
-    assert fan_w("hvac.crac.min_flow_ratio=0.6") > 1.05 * free_w
-
-
-def test_parts_of_an_inlet_add_up_while_a_unit_is_down() -> None:
-    config = load_config("corrected", [FOUR, *MINUTES, LOST])
-    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 1.0)))
-    with Simulator(config, drivers=drivers, precision="f64") as sim:
-        sim.reset()
-        for _ in range(6):
-            sim.step()
-        parts = Inlets(sim.fleet, 0, sim.intake_air()).parts(3)
-        hottest_c = sim.servers().inlet_c[600:800].max()
-    assert parts.unit_share[0] < 0.1
-    assert parts.inlet_c == pytest.approx(hottest_c, abs=1e-9)
-
-
 HEAT_UNITS = {
     "down": [N_PLUS_1, LOST],
     "one coil small": ["hvac.crac.capacity_kw=[60, 200, 200, 200]"],
@@ -239,12 +177,6 @@ def test_a_coil_takes_no_more_than_its_capacity_and_the_others_take_the_rest() -
     np.testing.assert_allclose(slowly[-1].unit_supply_c, results[0].unit_supply_c, atol=0.05)
 
 
-def test_capacity_that_suffices_changes_nothing() -> None:
-    _, plain = run_at_full_load(FOUR)
-    _, large = run_at_full_load(FOUR, "hvac.crac.capacity_kw=200")
-    np.testing.assert_allclose(large[0].rack_inlet_c, plain[0].rack_inlet_c, rtol=1e-12)
-
-
 @pytest.mark.filterwarnings("ignore:.*the coils take out:sdc_taichi.OddInputWarning")
 def test_coils_that_are_too_small_leave_the_rest_to_the_room() -> None:
     _, results = run_at_full_load(FOUR, *MINUTES, "hvac.crac.capacity_kw=100", steps=30)
@@ -278,19 +210,6 @@ def test_return_air_control_warms_the_supply_air_at_part_load(
         assert supply_c[0] < r.supply_c[0] < supply_c[1]
         assert 33.0 - 2.0 < r.return_c[0] < 33.0 + 0.1
     assert found[0].supply_c[0] == pytest.approx(found[1].supply_c[0], abs=0.02)
-
-
-def test_return_air_control_is_continuous_in_load() -> None:
-    config = load_config("corrected", HEAT_UNITS["return air"])
-    loads = np.linspace(0.0, 1.0, 201)
-    fleet = build_fleet([config] * len(loads))
-    supply = CracUnits(fleet, UnitIndex(fleet)).initial_supply()
-    met = Conditions(
-        supply.coldest_supply_c, loads, unit_low=supply.unit_low, unit_high=supply.unit_high
-    )
-    found = Hall(fleet, "f64").solve(met)
-    assert np.max(np.abs(np.diff(found.supply_c))) < 0.1
-    assert np.max(np.abs(np.diff(found.inlet_max_c))) < 0.1
 
 
 @pytest.mark.parametrize("case", ["down", "three coils at their limit", "return air"])

@@ -95,7 +95,7 @@ def test_every_field_of_a_configuration_has_an_anchor(
     assert "| `electric_air_cooled` | outdoor air | 3 | any |" in made
     text = stage.with_field_anchors(made)
     assert "| `seeds` |" in tables.suite_markdown()
-    assert "| `gamma` |" in tables.settings_markdown()
+    assert "| `memory_rate` |" in tables.settings_markdown()
     anchors = re.findall(r'id="([^"]+)"', text)
     assert len(anchors) == len(set(anchors))
     named = set(fields(load_config("corrected").model_dump(), ""))

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sdc_taichi import SdcError, load_config
-from sdc_taichi.cli.hall import LISTED_ROWS, describe_hall, hall_app
+from sdc_taichi.cli.hall import describe_hall, hall_app
 from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.design_hall import (
@@ -119,44 +119,6 @@ def test_approach_model_has_inlets_and_no_flows() -> None:
     assert "return air" not in text
     assert "spectral" not in text
     assert "inlet model approach" in text
-
-
-def test_rows_and_places(corrected: DesignHall) -> None:
-    lines = describe_hall(corrected).splitlines()
-    rows = [line.split() for line in lines[-4:]]
-    for i, cells in enumerate(rows):
-        mine = slice(5 * i, 5 * i + 5)
-        assert cells[:2] == [str(i), "+y" if i % 2 == 0 else "-y"]
-        assert float(cells[2]) == pytest.approx(corrected.it_w[mine].sum() / 1e3, abs=0.05)
-        assert float(cells[4]) == pytest.approx(corrected.approach_k[mine].mean(), abs=0.005)
-        assert float(cells[6]) == pytest.approx(corrected.inlet_c[mine].mean(), abs=0.005)
-        assert float(cells[8]) == pytest.approx(corrected.inlet_max_c[mine].max(), abs=0.005)
-    # Top zone of five: servers 160..199 of 200.
-    assert corrected.hottest_server == 160
-    # At an end of an outer row, where air comes round it.
-    assert corrected.hottest_rack in (0, 4, 15, 19)
-
-
-def test_large_halls_list_their_hottest_rows() -> None:
-    rows, per_row = 30, 4
-    approach = np.full((rows, per_row), 5.0)
-    hot = np.arange(1, 2 * LISTED_ROWS, 2)
-    approach[hot] = 5.5
-    config = load_config(
-        "corrected",
-        [
-            f"hall.rows={rows}",
-            f"hall.racks_per_row={per_row}",
-            *WIDE[1:],
-            f"hall.supply_approach_k={approach.ravel().tolist()}",
-            "hvac.crac.units=20",
-        ],
-    )
-    text = describe_hall(solve_design_hall(config))
-    table = text[text.index("row  faces") :].splitlines()
-    assert [int(line.split()[0]) for line in table[2:-1]] == hot.tolist()
-    assert table[-1] == f"({LISTED_ROWS} hottest of {rows} rows)"
-    assert "unit 0" not in text
 
 
 def test_radius_of_a_hall_too_large_to_iterate_is_bounded_by_its_rows() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -164,43 +162,6 @@ def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             build_fleet(matrix_hall(file, *overrides))
-
-
-def archive(path: Path, header: str, values: bytes, flag_bits: int = 0) -> bytes:
-    """An .npz file of one compressed array with this header."""
-    start = np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header.encode()
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("R.npy", start + values)
-    content = bytearray(path.read_bytes())
-    content[6] |= flag_bits
-    content[content.index(b"PK\1\2") + 8] |= flag_bits
-    path.write_bytes(content)
-    return bytes(content)
-
-
-def test_archives_that_are_damaged_encrypted_or_larger_than_they_seem(tmp_path: Path) -> None:
-    path = tmp_path / "r.npz"
-    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s), }\n"
-    values = np.full((6, 6), 0.05).tobytes()
-    whole = archive(path, header % "6, 6", values)
-    build_fleet(matrix_hall(path))
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        damaged = bytearray(whole[: rng.integers(1, len(whole))] if seed % 2 else whole)
-        damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
-        path.write_bytes(damaged)
-        with contextlib.suppress(ConfigError):
-            build_fleet(matrix_hall(path))
-    for shape, content, flag_bits, message in (
-        ("6, 6", values, 1, "array R: .*encrypted"),
-        ("99999999, 99999999", values, 0, r"R has shape \(99999999, 99999999\), expected \(6, 6\)"),
-        ("6, 6", values + bytes(9), 0, "R goes on after its last value"),
-        ("6, 6", values[:-8], 0, "array R: "),
-        ("6, -6", values, 0, "valid are numbers"),
-    ):
-        archive(path, header % shape, content, flag_bits)
-        with pytest.raises(ConfigError, match=rf"r\.npz: .*{message}"):
-            build_fleet(matrix_hall(path))
 
 
 @pytest.mark.parametrize(

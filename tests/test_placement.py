@@ -173,13 +173,6 @@ def test_a_hall_by_hand() -> None:
     assert placed[0] == 0.4
 
 
-def test_without_limits_uniform_repeats_the_utilisation() -> None:
-    case = case_of([3, 5], [0.1, 1.0], count=[7.0] * 8)
-    load, placed = case.place("uniform")
-    np.testing.assert_array_equal(load, [0.1] * 3 + [1.0] * 5)
-    np.testing.assert_array_equal(placed, case.utilisation)
-
-
 def test_a_limited_neighbour_changes_no_bit_of_a_uniform_load() -> None:
     # Through servers and back, a tenth or so of these would come out rounded otherwise.
     rng = np.random.default_rng(2)
@@ -200,11 +193,6 @@ def test_coolest_first_breaks_ties_by_index() -> None:
     np.testing.assert_allclose(case.place("coolest-first")[0], [0.0, 1.0, 0.5])
 
 
-def test_racks_beyond_the_limit_share_what_the_others_leave() -> None:
-    case = case_of([3], [0.5], inlet_c=[30.0, 45.0, 20.0])
-    np.testing.assert_allclose(case.place("inlet-aware")[0], [0.25, 0.25, 1.0])
-
-
 def test_a_data_center_without_capacity_places_nothing() -> None:
     case = case_of([2, 2], [0.5, 0.5], count=[3.0] * 4, capacity=[0.0, 0.0, 1.0, 1.0])
     for policy in POLICIES:
@@ -213,29 +201,11 @@ def test_a_data_center_without_capacity_places_nothing() -> None:
         np.testing.assert_allclose(placed, [0.0, 0.5])
 
 
-def test_a_large_hall_conserves_work() -> None:
-    rng = np.random.default_rng(5)
-    n = 100_000
-    case = Case(
-        np.array([0, n]),
-        np.array([0.37]),
-        rng.integers(1, 90, n).astype(np.float64),
-        rng.choice([0.3, 0.7, 1.0], n),
-        rng.uniform(18.0, 30.0, n),
-        rng.exponential(size=n),
-    )
-    for policy in POLICIES:
-        load, placed = case.place(policy)
-        assert placed[0] == 0.37
-        assert case.count @ load == pytest.approx(0.37 * case.count.sum(), rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("policy", "changes", "message"),
     [
         ("weights", {"weights": None}, "placement weights: none given"),
         ("weights", {"weights": np.ones(3)}, r"shape \(3,\), expected \(4,\)"),
-        ("weights", {"weights": "heavy"}, "'heavy': valid are numbers"),
         (
             "weights",
             {"weights": [1.0, 1.0, 1.0, -2.0]},

@@ -103,16 +103,6 @@ def test_racks_restart_in_stages_of_each_data_center() -> None:
     np.testing.assert_array_equal(found, [0, 1, 1, 0, 0, 1, 0])
 
 
-def test_without_limits_nothing_happens() -> None:
-    found = after([NORMAL] * 2, [20.0, 500.0], 500.0, **dict.fromkeys(LIMITS, np.inf))
-    np.testing.assert_array_equal(found, NORMAL)
-
-
-def test_each_rack_has_its_own_limits() -> None:
-    limits = {"limit_c": np.array([32.0, 30.0, np.inf]), "trip_c": np.array([37.0, 35.0, np.inf])}
-    np.testing.assert_array_equal(after([NORMAL] * 3, 36.0, **limits), [THROTTLED, TRIPPED, NORMAL])
-
-
 def test_capacity_by_status() -> None:
     status = np.array([NORMAL, THROTTLED, TRIPPED], np.int8)
     np.testing.assert_array_equal(capacity(status, 0.4), [1.0, 0.4, 0.0])

@@ -19,7 +19,6 @@ from sdc_taichi import (
 )
 from sdc_taichi.hall.rack_servers import rack_servers
 from sdc_taichi.hall.recirculation import calibrate
-from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.types import F64
 from test_ledgers import record
 
@@ -74,29 +73,6 @@ def test_racks_of_8_and_30_kw_warm_their_air_alike(mixed: Path) -> None:
     equal = ["servers.fan_full_airflow_m3s=0.035", "hvac.crac.supply_m3s_per_w=6e-5"]
     with pytest.raises(ConfigError, match=r"racks 16, 17 warm the air by 4[78]\.\d K .* 40 K"):
         build_fleet(load_config(mixed, [alike, *equal]))
-
-
-def test_gpu_servers_leave_the_air_of_other_racks_alone() -> None:
-    types = (
-        "{cpu: {servers: {count: 40, full_w: 200, idle_w: 40}},"
-        " gpu: {servers: {count: 10, full_w: 10000, idle_w: 1000, height_u: 4}}}"
-    )
-    plan = "[{rows: 0-1, type: cpu}, {rows: 2, racks: 0-2, type: cpu},"
-    plan += " {rows: 2, racks: 3-4, type: gpu}, {rows: 3, type: cpu}]"
-    changes = [f"hall.rack_types={types}", f"hall.rack_plan={plan}"]
-    alike = "hall.recirculation.calibrate=rack"
-    config = load_config("corrected", [*SETTINGS, *changes, alike])
-    with pytest.warns(OddInputWarning, match="rack 13 has servers of 100 kW"):
-        build_fleet(config)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        found = solve_design_hall(config)
-    cpu = np.array(found.config.hall.rack_type_names()) == "cpu"
-    np.testing.assert_allclose(found.airflow_m3s[cpu], 0.57, atol=0.02)
-    np.testing.assert_allclose(found.airflow_m3s[~cpu], 7.15, atol=0.2)
-    assert found.air is not None
-    assert found.air.exhaust_share.max() < 0.3
-    assert found.air.rti_pct < 120
 
 
 def test_odd_airflow_is_warned_of(mixed: Path) -> None:
@@ -190,15 +166,6 @@ def test_every_ledger_closes_in_a_mixed_hall(thermal: str, mixed: Path) -> None:
     run = record([config], count, drivers, "f64")
     for name in LEDGERS if thermal == "quasi_steady" else TRANSIENT_LEDGERS:
         assert residual(LEDGERS[name](run), 1e-6).max() < 1e-11, name
-
-
-def test_heat_capacities_are_those_of_the_servers_of_the_types(mixed: Path) -> None:
-    config = load_config(mixed)
-    servers = [group for rack in config.rack_groups() for group in rack]
-    mean_w = config.rack_nameplate_w().sum() / sum(group.count for group in servers)
-    assert mean_w > 200.0
-    assert config.server_heat_capacity_kj_per_k == pytest.approx(0.030 * mean_w)
-    assert config.room_heat_capacity_kj_per_k == pytest.approx(0.015 * mean_w)
 
 
 def test_servers_without_air_are_refused() -> None:

@@ -78,9 +78,7 @@ _Loader.yaml_implicit_resolvers = {
 }
 for _name, _pattern in (("int", _WHOLE), ("float", _NUMBER)):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", _pattern, list("-+.0123456789"))
-_Loader.add_constructor(
-    "tag:yaml.org,2002:int", lambda loader, node: parse_whole(loader.construct_scalar(node))
-)
+_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: parse_whole(node.value))
 
 
 def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
