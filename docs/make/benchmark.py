@@ -127,13 +127,15 @@ def section(
     parts = [markdown(shown, titles)]
     files = [f"[{name}](benchmark/{suite.name}-{name}.csv)" for name in tables]
     commands = dict.fromkeys(f"`{command_of(text)}`" for text in suite.commands)
-    about = f"Case {board.case.name}. {weeks_text(board)} {cost_text(suite)} {made_by(suite)}"
-    end = f"Tables: {', '.join(files)}. Made by {', '.join(commands)}. {literal_markdown(about)}"
+    about = f"{weeks_text(board)} {cost_text(suite)} {made_by(suite)}"
+    end = f"Complete tables are in {', '.join(files)}. All results were computed with "
+    end += f"{', '.join(commands)}. {literal_markdown(about)}"
     for picture in case_pictures(board)[:1]:
         path = f"img/benchmark-{suite.name}.webp"
         write(docs / path, webp(picture.draw(), 80)[-1])
         parts.append(f"![Intervals of the rows of suite {suite.name}]({path})")
-        end = f"{literal_markdown(picture.caption)} {end}"
+        case = f"The picture is for case {board.case.name}."
+        end = f"{literal_markdown(f'{case} {picture.caption}')} {end}"
     parts.append(end)
     return [*parts, *(f"> {literal_markdown(text)}" for text in suite_notes(suite))]
 
@@ -181,7 +183,7 @@ def made_by(suite: SuiteResults) -> str:
     versions = sorted({record.version for record in records})
     features = [(x.processor.get("architecture"), x.processor.get("processor")) for x in records]
     processors = sorted({f"{architecture} with {name}" for architecture, name in features})
-    return f"Version {', '.join(versions)}; {'; '.join(processors)}."
+    return f"The package had version {', '.join(versions)}, the processor was {'; '.join(processors)}."
 
 
 def write_cells(suite: SuiteResults, board: Leaderboard, folder: Path) -> None:

@@ -151,7 +151,7 @@ def cost_text(suite: SuiteResults) -> str:
     optima_h = sum(case.optima_core_s for case in suite.cases.values()) / 3600
     return (
         f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
-        f"trained rows; solving for optima took {optima_h:.2g} more."
+        f"trained rows; computing the optima took {optima_h:.2g} more."
     )
 
 
@@ -217,8 +217,8 @@ def _notes_of_case(case: CaseResults) -> list[str]:
         notes.append(f"fewer than {FEWEST} weeks of a site, so rows have no place.")
     if not any(result.frame["achieved_figure"].notna().any() for result in results):
         notes.append(
-            "without an optimum the ends of weeks have no value, so that an empty battery or "
-            "delayed work counts as a saving."
+            "no optimum was computed, so stored energy and delayed work at the end of a week have "
+            "no value: an empty battery or delayed work counts as a saving."
         )
     return notes
 
@@ -278,8 +278,8 @@ def weeks_text(board: Leaderboard) -> str:
     sites, weeks = list(dict.fromkeys(first["site"])), list(dict.fromkeys(first["week"]))
     objective = board.case.objective
     return (
-        f"Objective {objective} ({objective.unit}), weeks {', '.join(map(str, weeks))} of "
-        f"{_named([str(site) for site in sites])}."
+        f"The objective is {objective} ({objective.unit}), in weeks "
+        f"{', '.join(map(str, weeks))} of {_named([str(site) for site in sites])}."
     )
 
 
@@ -341,9 +341,10 @@ def _interval_picture(board: Leaderboard) -> Picture | None:
     if len(ends) < 2:
         return None
     what = "share of the achievable (%)" if has_share else "change against idle commands (%)"
-    caption = f"{what[0].upper()}{what[1:]} with 95 % intervals; places in brackets."
+    caption = f"The picture shows the {what} of each row with its 95 % interval, and its place in "
+    caption += "brackets."
     if left:
-        caption += f" Left out: {', '.join(left)}."
+        caption += f" Rows outside its range are left out: {', '.join(left)}."
 
     def draw() -> Figure:
         return interval_plot(ends, what, marks=(0.0, 100.0) if has_share else (0.0,))
