@@ -183,7 +183,7 @@ def made_by(suite: SuiteResults) -> str:
     versions = sorted({record.version for record in records})
     features = [(x.processor.get("architecture"), x.processor.get("processor")) for x in records]
     processors = sorted({f"{architecture} with {name}" for architecture, name in features})
-    return f"The package had version {', '.join(versions)}, the processor was {'; '.join(processors)}."
+    return f"Version {', '.join(versions)} ran on {'; '.join(processors)}."
 
 
 def write_cells(suite: SuiteResults, board: Leaderboard, folder: Path) -> None:
