@@ -224,23 +224,6 @@ def test_greedy_follows_the_mean_of_the_coming_day() -> None:
 # What a controller sees
 
 
-def test_view_before_and_after_a_step(sim: Simulator) -> None:
-    look = view_maker(sim)
-    first = look(None)
-    assert first.last is None
-    assert first.state.step == 0
-    result = sim.step()
-    then = look(result)
-    assert then.last is result
-    assert then.state is sim.state
-    assert then.size == 3
-    assert then.step_h == 0.25
-    assert then.sizing is sim.sizing
-    coming = sim.step()
-    assert np.array_equal(then.now.demand, coming.demand)
-    assert np.array_equal(then.now.ci_g_per_kwh, coming.ci_g_per_kwh)
-
-
 def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
     configs = fleet_of(3, overrides=["site.start=12-31"])
     configs[1] = load_config("tiny", ["name=other", "site.location=CA", "site.start=06-01"])
@@ -306,20 +289,6 @@ def test_a_constant_must_suit_every_data_center() -> None:
     narrow = load_config("tiny", ["name=narrow", "hvac.setpoint.max_c=20"])
     with pytest.raises(ConfigError, match=r"16\.\.20 C \(hvac\.setpoint of narrow\)"):
         make_controller("constant:21", build_fleet([TINY, narrow]))
-
-
-def test_own_controllers_need_no_base_class(sim: Simulator) -> None:
-    class Alternate:
-        def reset(self, seed: int) -> None:
-            self.turn = seed
-
-        def act(self, view: View) -> Actions:
-            self.turn += 1
-            return Actions(battery=float((-1) ** self.turn))
-
-    kept = results(sim, Alternate(), 4)
-    assert [float(r.battery_command[0]) for r in kept] == [-1.0, 1.0, -1.0, 1.0]
-    assert CONTROLLABLE == ("load", "cooling", "battery")
 
 
 # Controllers of the user's own

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
 import re
 import subprocess
@@ -183,17 +182,6 @@ def test_batch_is_what_gymnasium_makes_of_single_environments(
     one_by_one.close()
 
 
-def test_batches_start_the_next_episodes_when_gymnasiums_own_do() -> None:
-    default = inspect.signature(SyncVectorEnv).parameters["autoreset_mode"].default
-    batches: list[Any] = [
-        gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
-        SdcVectorEnv(2, **tiny()),
-        multi_agent(2, **tiny()),
-    ]
-    for env in batches:
-        assert env.metadata["autoreset_mode"] is default
-
-
 def test_multi_agent_batches_have_the_attributes_of_pettingzoo() -> None:
     env, parallel = multi_agent(2, **BUSY), sdc_taichi.parallel_env(**BUSY)
     assert env.num_agents == len(env.agents) == 3
@@ -338,15 +326,6 @@ def test_agents_of_a_saved_episode() -> None:
     other.load_state_dict(saved)
     assert other.agents == list(AGENTS)
     assert same(other.step(action), env.step(action))
-
-
-def test_a_state_is_not_changed_by_going_on() -> None:
-    env = multi_agent(2, **tiny(rewards={"agent_dc": {"demand_charge": 1.0}}))
-    trajectory(env, env.reset(seed=2), 3)
-    saved = env.state_dict()
-    kept = pickle.dumps(saved)
-    trajectory(env, None, STEPS)
-    assert pickle.dumps(saved) == kept
 
 
 def test_across_spawned_processes() -> None:
@@ -574,14 +553,6 @@ def test_without_autoreset_a_batch_waits_for_reset(kind: str) -> None:
 
 
 # --- malformed arguments ---
-
-
-@pytest.mark.parametrize("number", [0, -1, 2.5, True])
-def test_number_of_environments(number: Any) -> None:
-    for make in (multi_agent, SdcVectorEnv):
-        with pytest.raises(ConfigError, match=f"num_envs {number}: valid is a whole number"):
-            make(number, **tiny())
-    assert multi_agent(np.int64(3), **tiny()).num_envs == 3  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,7 +13,6 @@ import pytest
 
 import sdc_taichi
 from sdc_taichi import (
-    Actions,
     ConfigError,
     DataCenterConfig,
     EnvOptions,
@@ -22,13 +20,10 @@ from sdc_taichi import (
     load_config,
     with_values,
 )
-from sdc_taichi.control import CONTROLLABLE, FixedSetpoint, GreedyCarbon, Idle, PerAgent
+from sdc_taichi.control import FixedSetpoint, GreedyCarbon, Idle, PerAgent
 from sdc_taichi.envs import IDS
-from sdc_taichi.envs.actions import BATTERY_COMMANDS
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
-from sdc_taichi.envs.features import all_features
-from sdc_taichi.envs.reward_terms import TERMS
-from sdc_taichi.envs.rewards import REWARD_SETS, SCALED_SETS
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.envs.vector import SdcVectorEnv
 
@@ -231,23 +226,6 @@ def choices(option: str) -> set[str]:
     annotation = EnvOptions.model_fields[option].annotation
     nested = [get_args(part) or (part,) for part in get_args(annotation)]
     return {value for part in nested for value in part if isinstance(value, str)}
-
-
-def test_choices_are_what_there_is() -> None:
-    """A new observer, action order or agent is named in ``EnvOptions`` and the other way round."""
-    assert choices("action_order") == set(BATTERY_COMMANDS)
-    assert choices("agents") == set(AGENTS)
-    assert tuple(AGENT_DEFINITIONS) == AGENTS
-    agents = AGENT_DEFINITIONS.values()
-    assert tuple(agent.command for agent in agents) == CONTROLLABLE
-    settable = {name for agent in agents for name in agent.commands}
-    assert settable == {field.name for field in fields(Actions)}
-    assert {agent for agent in IDS.values() if agent is not None} == set(AGENTS)
-    names = {feature.name for feature in all_features()}
-    for agent in agents:
-        assert set(agent.features) <= names
-        assert tuple(agent.scales) == SCALED_SETS
-        assert all(set(scales) <= set(TERMS) for scales in agent.scales.values())
 
 
 @pytest.mark.parametrize("option", ["actions", "observations", "start"])

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, MultiDiscrete
 from gymnasium.utils.env_checker import check_env
 
 import sdc_taichi
-from sdc_taichi import ConfigError, SdcError, load_config
+from sdc_taichi import ConfigError, load_config
 from sdc_taichi.envs.actions import PLACEMENT_FACTOR
 from sdc_taichi.envs.agents import AGENTS
 
@@ -208,10 +208,3 @@ def test_placement_needs_halls_of_as_many_racks() -> None:
     )
     with pytest.raises(ConfigError, match=r"same number of racks; it is \[20, 4\]"):
         sdc_taichi.vector_env(config=[large, small], commands={"agent_ls": ["placement"]})
-
-
-def test_shape_of_an_action_of_several_commands() -> None:
-    env = sdc_taichi.parallel_env(**ALL)
-    env.reset(seed=0)
-    with pytest.raises(SdcError, match=re.escape("agent_dc: shape (1, 2), expected (1, 4)")):
-        env.step({"agent_ls": [1] * (1 + RACKS), "agent_dc": [1, 1], "agent_bat": 1})

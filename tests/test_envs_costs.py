@@ -85,23 +85,6 @@ def test_every_kind_of_environment_tells_the_same_costs() -> None:
     assert of_single["cost_grid_kwh_twice"] == 2 * of_single["grid_kwh"] > 0
 
 
-def test_costs_of_the_step_that_ends_an_episode() -> None:
-    for mode in ("SameStep", "NextStep"):
-        env: Any = gymnasium.make_vec(
-            "sdc_taichi/Battery-v0",
-            num_envs=2,
-            autoreset_mode=mode,
-            **{**options(costs=[grid_kwh]), "config": "tiny"},
-        )
-        env.reset(seed=0)
-        for _ in range(96):
-            infos = env.step(np.array([1, 0]))[4]
-        last = infos["final_info"] if mode == "SameStep" else infos
-        assert last["cost"].tolist() == last["grid_kwh"].tolist()
-        assert ("cost" in infos) == (mode == "NextStep")
-        assert "cost" in env.step(np.array([1, 0]))[4] or mode == "NextStep"
-
-
 def grid_kwh_twice(result: StepResult, view: View) -> list[float]:
     return (2 * result.grid_kwh).tolist()  # type: ignore[no-any-return]
 

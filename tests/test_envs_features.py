@@ -17,7 +17,6 @@ from sdc_taichi import (
     ConfigError,
     DataCenterConfig,
     Drivers,
-    RuntimeStateError,
     SdcError,
     Simulator,
     drivers_from_arrays,
@@ -388,12 +387,6 @@ def test_successive_forecasts_of_one_hour_are_consistent() -> None:
     assert np.max(np.abs(mixed)) < 5 / math.sqrt(count)
 
 
-def test_ci_forecasts_are_never_negative() -> None:
-    [(ci, _, _)] = walk_forecasts(ForecastError(2.0, 0.0), 500, [0])
-    assert ci.min() == 0.0
-    assert np.count_nonzero(ci == 0.0) > 100
-
-
 def test_series_that_end_repeat_from_their_own_start() -> None:
     """Series of unlike length, shorter than a lead, and read past their ends."""
     rng = np.random.default_rng(3)
@@ -489,19 +482,6 @@ def test_wrong_choices_name_what_is_valid(options: dict[str, Any], message: str)
         Observer(sim.fleet, **options)
 
 
-def test_reset_comes_first_and_errors_need_walks() -> None:
-    with Simulator(fleet_of("tiny")) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(None)
-        observer = Observer(sim.fleet)
-        with pytest.raises(RuntimeStateError, match="reset"):
-            observer.observe(view)
-        with pytest.raises(ConfigError, match="without walks"):
-            observer.reset(replace(view, forecast_error=ForecastError(0.1, 0.0)))
-        observer.reset(view)
-        assert observer.observe(view)["agent_ls"].shape == (3, 40)
-
-
 # Several CRAC units
 
 
@@ -585,10 +565,3 @@ def test_values_beyond_a_range_and_series_that_never_change() -> None:
     entries = parts(seen[0][2], observer.state_features)
     for name in ("ci_rank", "ci_relative", "ci_swing"):
         assert not entries[name].any()
-
-
-@pytest.mark.parametrize("value", [-0.1, math.nan, "big"])
-@pytest.mark.parametrize("field", ["ci_share", "temperature_k"])
-def test_wrong_errors_are_refused(field: str, value: Any) -> None:
-    with pytest.raises(ConfigError, match=f"forecast error {field}"):
-        ForecastError(**{field: value})

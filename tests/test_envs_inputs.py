@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import re
 from pathlib import Path
 from typing import Any
@@ -122,20 +121,6 @@ def test_every_kind_of_environment_draws_the_same(
         of_batch = batch.step(np.ones((3, 3), dtype=int))[4]
     years = multi.core.start_info()["year"]
     assert len(set(years.tolist())) > 1
-
-
-@pytest.mark.parametrize("saved_after", [0, 40, STEPS])
-def test_saved_states_go_on_in_the_same_year(saved_after: int) -> None:
-    env, other = (sdc_taichi.parallel_env(**DRAWN) for _ in range(2))
-    env.reset(seed=4)
-    run_episode(env, saved_after)
-    saved = pickle.dumps(env.state_dict())
-    other.reset(seed=1)
-    other.load_state_dict(pickle.loads(saved))
-    assert other.core.start_info() == env.core.start_info()
-    if saved_after < STEPS:
-        assert run_episode(other, 20) == run_episode(env, 20)
-    assert other.reset()[1] == env.reset()[1]
 
 
 def test_states_of_other_draws_are_refused_and_change_nothing() -> None:

@@ -28,7 +28,6 @@ from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, StepResult, lo
 from sdc_taichi.control import View
 from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.recording import capped_cubic_schedule
-from sdc_taichi.viz import recording_blocks
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_output import RecordingWarning
 
@@ -370,27 +369,6 @@ def test_without_a_viewer_the_episode_goes_on() -> None:
         play(env, 5)
     assert len(warned) == 1
     env.close()
-
-
-def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_blocks, "MAX_BLOCK_STEPS", 10)
-    folder, moved = tmp_path / "runs", tmp_path / "moved"
-    folder.mkdir()
-    settings = EpisodeRecorder(folder / "run.rrd", episode_trigger=ALL)
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=settings)
-    play(env, 15)
-    folder.rename(moved)
-    with pytest.warns(RecordingWarning, match=r"run-episode-0\.rrd: cannot be written") as warned:
-        go_on(env, 30)
-    assert len(warned) == 1
-    with pytest.warns(RecordingWarning, match="episode 1 goes on without a recording"):
-        play(env, 3)
-    folder.mkdir()
-    play(env, 2)
-    env.close()
-    assert files(folder) == ["run-episode-2.rrd"]
-    # The file that kept others out has moved along.
-    assert files(moved) == [".run-episode-0.rrd.part", "run-episode-0.rrd"]
 
 
 @pytest.mark.parametrize(

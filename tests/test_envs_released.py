@@ -31,7 +31,7 @@ from sdc_taichi import (
 from sdc_taichi.control.view import View, view_maker
 from sdc_taichi.envs import released
 from sdc_taichi.envs.released import FEATURES, ReleasedObserver, ReleasedRewards
-from sdc_taichi.errors import DataError, RuntimeStateError
+from sdc_taichi.errors import DataError
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64, StepResult
@@ -401,16 +401,3 @@ def test_rewards_need_a_carbon_intensity_that_varies() -> None:
         view = view_maker(sim)(None)
         with pytest.raises(DataError, match="of data center 1 is 310 g/kWh throughout"):
             ReleasedRewards().reset(view)
-        result = sim.step()
-        with pytest.raises(RuntimeStateError, match="rewards have not been reset"):
-            ReleasedRewards().rewards(result, view)
-
-
-def test_vectors_have_the_released_sizes() -> None:
-    spaces = ReleasedObserver().spaces
-    assert {agent: space.shape for agent, space in spaces.items()} == {
-        "agent_ls": (26,),
-        "agent_dc": (14,),
-        "agent_bat": (13,),
-    }
-    assert all(space.is_bounded() for space in spaces.values())

@@ -150,18 +150,3 @@ def test_fewer_steps_than_the_days_have() -> None:
             gymnasium.make_vec(
                 "sdc_taichi/Joint-v0", config="tiny", days=1, max_episode_steps=wrong
             )
-
-
-def test_no_event_starts_after_the_last_of_fewer_steps() -> None:
-    def made(steps: int) -> Any:
-        return gymnasium.make_vec(
-            "sdc_taichi/Joint-v0",
-            config="tiny",
-            overrides=["events.scheduled=[{kind: grid_outage, start_h: 3, duration_h: 1}]"],
-            days=1,
-            max_episode_steps=steps,
-        )
-
-    with pytest.raises(ConfigError, match=r"start_h 3: the episode ends after 3 h"):
-        made(12)
-    assert made(13).spec.max_episode_steps == 13

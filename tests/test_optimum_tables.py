@@ -11,20 +11,19 @@ import pytest
 
 from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, OddInputWarning
+from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.optimum import tables
 from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
 from sdc_taichi.optimum.problem import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.tables import (
     FacilityTable,
     Nodes,
-    TableGrid,
     facility_tables,
 )
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
 JULY = "site.start=07-01"
-GRID = TableGrid(utilisations=3, setpoint_step_k=4.0)
+GRID: dict[str, Any] = {"utilisations": 3, "setpoint_step_k": 4.0}
 CASES = {
     "tiny": ("tiny", JULY),
     "corrected": ("corrected", JULY),
@@ -80,7 +79,7 @@ def test_entries_are_what_the_simulator_does(case: str) -> None:
     drivers, fleet = load_drivers([config]), build_fleet(config)
     assert no_table_reasons(fleet) == (None,)
     start, steps = drivers.start + 40, 3
-    (table,) = facility_tables(fleet, drivers, start=start, steps=steps, grid=GRID, precision="f64")
+    (table,) = facility_tables(fleet, drivers, start=start, steps=steps, **GRID, precision="f64")
     assert np.all(table.unmet_w == 0)
     with Simulator(fleet, drivers=drivers, precision="f64") as sim:
         for i, level in enumerate(table.utilisation):
@@ -103,12 +102,12 @@ def test_a_data_center_has_the_same_table_alone_and_beside_others() -> None:
     ]
     drivers = load_drivers(configs)
     start = drivers.start
-    together = facility_tables(build_fleet(configs), drivers, start=start, steps=2, grid=GRID)
+    together = facility_tables(build_fleet(configs), drivers, start=start, steps=2, **GRID)
     assert together[0] is together[2]
     assert [len(t.setpoint_c) for t in together] == [3, 2, 3]
     for config, found in zip(configs, together, strict=True):
         own = load_drivers([config])
-        (alone,) = facility_tables(build_fleet(config), own, start=own.start, steps=2, grid=GRID)
+        (alone,) = facility_tables(build_fleet(config), own, start=own.start, steps=2, **GRID)
         assert np.array_equal(alone.facility_kwh, found.facility_kwh)
         assert np.array_equal(alone.water_l, found.water_l)
 
@@ -119,9 +118,7 @@ def test_tables_are_fine_enough_between_their_nodes() -> None:
         config = load_config(preset, [])
         fleet, drivers = build_fleet(config), load_drivers([config])
         start = drivers.start
-        (table,) = facility_tables(
-            fleet, drivers, start=start, steps=2, grid=TableGrid(setpoint_step_k=10.0)
-        )
+        (table,) = facility_tables(fleet, drivers, start=start, steps=2, setpoint_step_k=10.0)
         counts.append(len(table.utilisation))
         spacing = table.utilisation[1]
         midway = np.arange(0.2, 0.9, 0.1) // spacing * spacing + spacing / 2
@@ -142,9 +139,7 @@ def test_tables_are_fine_enough_between_their_nodes() -> None:
 def test_entries_in_which_racks_throttle_are_barred() -> None:
     config = load_config("tiny", ["hvac.setpoint.max_c=32", "protection.ashrae_class=A1"])
     drivers = load_drivers([config])
-    (table,) = facility_tables(
-        build_fleet(config), drivers, start=drivers.start, steps=1, grid=GRID
-    )
+    (table,) = facility_tables(build_fleet(config), drivers, start=drivers.start, steps=1, **GRID)
     assert np.array_equal(np.isinf(table.unmet_w), table.inlet_max_c > 32.0)
     assert 0 < np.isinf(table.unmet_w).sum() < table.unmet_w.size
 
@@ -154,17 +149,9 @@ def test_heat_that_the_plant_leaves_is_in_the_table() -> None:
     drivers = load_drivers([config])
     with pytest.warns(OddInputWarning, match="take out 300 kW"):
         fleet = build_fleet(config)
-    (table,) = facility_tables(fleet, drivers, start=drivers.start, steps=1, grid=GRID)
+    (table,) = facility_tables(fleet, drivers, start=drivers.start, steps=1, **GRID)
     assert table.unmet_w[0, -1].min() > 0
     assert np.all(table.unmet_w[0, 0] == 0)
-
-
-@pytest.mark.parametrize(
-    "values", [{"utilisations": 1}, {"setpoint_step_k": 0.0}, {"setpoint_step_k": float("nan")}]
-)
-def test_a_grid_without_nodes_is_an_error(values: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match="table: "):
-        TableGrid(**values)  # type: ignore[arg-type]
 
 
 TABLELESS = {
@@ -232,7 +219,7 @@ def test_a_map_has_the_simulators_figures_at_its_nodes(plant: str) -> None:
             replace(drivers, outdoor_c=outdoor, wet_bulb_c=wet_bulb),
             start=still,
             steps=1,
-            grid=GRID,
+            **GRID,
             precision="f64",
         )
         assert found.facility_kwh[0, node, 2] == pytest.approx(table.facility_kwh[0], rel=1e-9)

@@ -248,18 +248,3 @@ def test_a_policy_acts_for_the_agents_that_do_not_learn(tmp_path: Path) -> None:
     assert varied(found[0], "load_command")
     assert varied(found[0], "cooling_command")
     assert not varied(found[0], "battery_command")
-
-
-def test_a_saved_episode_goes_on_under_a_policy() -> None:
-    configs = fleet_of()
-    made = PolicyController(policy(interface(), seed=3), build_fleet(configs))
-    env = vector_env(config=configs, agents=("agent_bat",), others=made, start="fixed", days=1)
-    env.reset(seed=0)
-    hold = {"agent_bat": np.ones(3, dtype=np.int64)}
-    for _ in range(10):
-        env.step(hold)
-    saved = env.state_dict()
-    expected = [env.core.step(hold).result for _ in range(10)]
-    env.load_state_dict(saved)
-    assert_equal([env.core.step(hold).result for _ in range(10)], expected)
-    env.close()

@@ -11,10 +11,8 @@ from sdc_taichi.kernels.arguments import Argument, in_row_order
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.planning_arguments import (
     QUEUE_ARGUMENTS,
-    QUEUE_ROWS,
     STEP_ROWS,
     STORE_ARGUMENTS,
-    STORE_ROWS,
 )
 from sdc_taichi.optimum.facility_map import FacilityMap
 from sdc_taichi.plant import workload
@@ -63,6 +61,7 @@ class PlanningKernel:
         size: int,
         horizon: int,
         *,
+        of_dc: Mapping[str, F64],
         commands: F64,
         peaks: int,
         table: F64 | None = None,
@@ -74,6 +73,7 @@ class PlanningKernel:
         Args:
             size: number of data centers, B.
             horizon: number of coming steps, H.
+            of_dc: rows of the argument ``of_dc`` by name, (B,) each.
             commands: commands of steps after the first.
             peaks: number of candidate peak powers of the month.
             table: argument ``table`` of the kernel, if it has one.
@@ -86,6 +86,7 @@ class PlanningKernel:
         chosen = np.zeros(size, dtype=np.int32)
         kwh = np.zeros((size, horizon)) if facility_kwh is None else facility_kwh
         by_dc: dict[str, Any] = of_each | {"chosen": chosen, "facility_kwh": kwh}
+        by_dc["of_dc"] = np.stack(in_row_order(self._arguments["of_dc"].rows, of_dc), axis=1)
         shared = {"commands": commands, "peaks": peaks, "horizon": horizon}
         if table is not None:
             shared["table"] = table
@@ -217,7 +218,7 @@ class QueuePlanner:
             commands=self._later,
             peaks=peaks,
             table=self._table,
-            of_dc=np.stack(in_row_order(QUEUE_ROWS, of_dc), axis=1),
+            of_dc=of_dc,
             coming=np.stack(in_row_order(STEP_ROWS, coming), axis=2),
             first_executed=now.started_tasks,
             first_waiting=waiting[:, None] + now.deferred_tasks - now.dequeued_tasks,
@@ -377,7 +378,7 @@ class StorePlanner:
             commands=self._later,
             peaks=peaks,
             facility_kwh=facility_kwh,
-            of_dc=np.stack(in_row_order(STORE_ROWS, of_dc), axis=1),
+            of_dc=of_dc,
             weight=cost.weight,
             first_grid=now.grid_kwh,
             first_stored=now.stored_kwh,

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Any, NamedTuple, Protocol, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -163,19 +163,6 @@ class Measurements(NamedTuple):
     """Energy in the battery, in kWh."""
     design: Design
     """Quantities of the design."""
-
-
-class NotedReads:
-    """Stands in for the result of a step and notes which of its quantities a function reads."""
-
-    step_h = 1.0
-
-    def __init__(self) -> None:
-        self.names: dict[str, None] = {}
-
-    def __getattr__(self, name: str) -> F64:
-        self.names[name] = None
-        return np.ones(1)
 
 
 FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
@@ -503,21 +490,14 @@ def feature_slices(features: Sequence[Feature]) -> dict[str, slice]:
     return {f.name: slice(first, first + f.size) for f, first in zip(features, ends, strict=False)}
 
 
-class _Sized(Protocol):
-    """A named part of an observation; equal parts are one feature."""
-
-    @property
-    def size(self) -> int:
-        """Number of entries side by side."""
-
-
 def entries_of_new_features(
-    features_of: Mapping[str, Sequence[_Sized]],
+    features_of: Mapping[str, Sequence[Any]],
 ) -> dict[str, npt.NDArray[np.int64] | slice]:
     """Entries of each agent's observation whose features no agent before it has.
 
     Args:
-        features_of: features of each agent, in the order of its observation.
+        features_of: features of each agent, in the order of its observation; each has a ``size``,
+            and equal ones are one feature.
     """
     known: set[Any] = set()
     out: dict[str, npt.NDArray[np.int64] | slice] = {}

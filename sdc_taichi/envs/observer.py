@@ -8,9 +8,7 @@ measured in the data center from one compiled stage, and those of single racks f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +22,6 @@ from sdc_taichi.envs.features import (
     Design,
     Layout,
     Measurements,
-    NotedReads,
     all_features,
     feature_slices,
     features_by_agent,
@@ -37,14 +34,10 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.time_rows import Forecasts, TimeRows
-from sdc_taichi.errors import RuntimeStateError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F32, F64, I64
-
-if TYPE_CHECKING:
-    pass
 
 
 class Observer:
@@ -131,9 +124,6 @@ class Observer:
 
         Args:
             view: the view before the first step.
-
-        Raises:
-            ConfigError: forecasts that err in a view without random walks.
         """
         self._time.reset(view)
         if view.sizing is not self._sizing:
@@ -141,11 +131,7 @@ class Observer:
         self._entries = None
 
     def observe(self, view: View) -> dict[str, F32]:
-        """Observation of each agent before the step to come, (B, n) each.
-
-        Raises:
-            RuntimeStateError: before ``reset``.
-        """
+        """Observation of each agent before the step to come, (B, n) each; after ``reset``."""
         entries = self._entries_of(view)
         observations: dict[str, F32] = {}
         for agent, runs in self._runs.items():
@@ -169,14 +155,12 @@ class Observer:
     def _entries_of(self, view: View) -> _Entries:
         """Entries of all features in a view, computed once for each view."""
         if self._entries is None or self._entries.view is not view:
-            if self._sizing is None:
-                raise RuntimeStateError("the observer has not been reset; call reset() first")
             self._entries = _Entries(view, *self._time.rows(view), self._measure(view))
         return self._entries
 
     def _measure(self, view: View) -> F32:
         """Scaled entries that do not depend on time alone, (m, B), one contiguous row each."""
-        state, last, layout = view.state, view.last, self._layout
+        state, layout = view.state, self._layout
         setpoints = (
             state.setpoint_c.reshape(-1, layout.units).T
             if self._equal_units
@@ -185,16 +169,11 @@ class Observer:
         inputs = {f"setpoint_{i}": setpoint_c for i, setpoint_c in enumerate(setpoints)}
         inputs |= {f"at_least_{i}": state.queue[:, k] for i, k in enumerate(self._age_columns)}
         inputs["waiting"], inputs["stored_kwh"] = state.queue[:, -1], state.stored_kwh
-        if last is None:
-            # In a hall at rest all air is at the setpoint, and everything else is 0.
-            at_c, zero = mean_setpoint_c(view), np.zeros(view.size)
-            inputs |= {name: at_c if name.endswith("_c") else zero for name in self._last_names}
-        else:
-            inputs |= zip(self._last_names, self._read_last(last), strict=True)
         if layout.fans:
             speeds = state.fan_speed.reshape(-1, layout.fans).T
             inputs |= {f"fan_{i}": speed for i, speed in enumerate(speeds)}
-        measured: F32 = self._stage.rows(**inputs).astype(np.float32)
+        last = _AtRest(view) if view.last is None else view.last
+        measured: F32 = self._stage.rows(last=last, **inputs).astype(np.float32)
         if not self._of_racks:
             return measured
         of_racks = [scale(f.value(view).astype(np.float32), f) for f in self._of_racks]
@@ -210,8 +189,8 @@ class Observer:
         features, layout, edges = self._measured, self._layout, range(len(self._age_columns))
         design = _design(view.sizing, view.step_h, self._per_full_queue)
 
-        def measurements(last: Any, x: Mapping[str, F64]) -> Measurements:
-            return Measurements(
+        def entries(last: Any, **x: F64) -> dict[str, F64]:
+            inputs = Measurements(
                 last=last,
                 waiting_tasks=x["waiting"],
                 at_least_tasks=[x[f"at_least_{i}"] for i in edges],
@@ -221,14 +200,6 @@ class Observer:
                 design=design,
             )
 
-        reads = NotedReads()
-        for feature in features:
-            feature.value(measurements(reads, _Ones()))
-        self._last_names = tuple(reads.names)
-        self._read_last = attrgetter(*self._last_names)
-
-        def entries(**x: F64) -> dict[str, F64]:
-            inputs = measurements(SimpleNamespace(**x), x)
             return {
                 f"{f.name}_{i}": np.clip((value - f.low) / (f.high - f.low), 0.0, 1.0)
                 for f in features
@@ -253,11 +224,14 @@ class _Entries(NamedTuple):
     """All other entries, (m, B)."""
 
 
-class _Ones(dict[str, Any]):
-    """Stands in for the inputs of the stage, whatever their names."""
+class _AtRest:
+    """Stands in for the result of a step before the first: air at the setpoint, and all else 0."""
 
-    def __missing__(self, name: str) -> F64:
-        return np.ones(1)
+    def __init__(self, view: View) -> None:
+        self._air_c, self._zero = mean_setpoint_c(view), np.zeros(view.size)
+
+    def __getattr__(self, name: str) -> F64:
+        return self._air_c if name.endswith("_c") else self._zero
 
 
 def make_observer(

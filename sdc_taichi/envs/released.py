@@ -23,7 +23,7 @@ from gymnasium.spaces import Box
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import AGE_EDGES_H, Feature
-from sdc_taichi.errors import DataError, RuntimeStateError
+from sdc_taichi.errors import DataError
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -207,19 +207,11 @@ class ReleasedObserver:
         self._capacity_kwh = np.where(battery_kwh > 0, battery_kwh, 1.0)
 
     def observe(self, view: View) -> dict[str, F32]:
-        """The vector of each agent before the step to come, (B, entries) each.
-
-        Raises:
-            RuntimeStateError: before ``reset``.
-        """
+        """The vector of each agent before the step to come, (B, entries) each; after ``reset``."""
         return {agent: self._vector(agent, view) for agent in self._agents}
 
     def state(self, view: View) -> F32:
-        """The vectors of all agents side by side, (B, m).
-
-        Raises:
-            RuntimeStateError: before ``reset``.
-        """
+        """The vectors of all agents side by side, (B, m); after ``reset``."""
         return np.concatenate([self._vector(agent, view) for agent in AGENTS], axis=1)
 
     def _vector(self, agent: str, view: View) -> F32:
@@ -232,8 +224,8 @@ class ReleasedObserver:
 
     def _entries(self, view: View) -> dict[str, F64]:
         """Entries of all agents by name, (B,) each, before they are cut at their ranges."""
-        if self._ci is None or self._outdoor is None:
-            raise RuntimeStateError("the observer has not been reset; call reset() first")
+        assert self._ci is not None, "reset comes first"
+        assert self._outdoor is not None
         state, last, drivers = view.state, view.last, view.drivers
         index = drivers.start + state.step
         time_of_day = self._time_of_day[index % len(self._time_of_day)]
@@ -515,12 +507,7 @@ class ReleasedRewards:
 
         Returns:
             r_LS, r_DC and r_BAT by agent, (B,) each.
-
-        Raises:
-            RuntimeStateError: before ``reset``.
         """
-        if self._fleet is None:
-            raise RuntimeStateError("the rewards have not been reset; call reset() first")
         low_kw, high_kw = self._bounds_kw
         footprint = footprint_reward(
             (result.ci_g_per_kwh - self._low_ci) / self._ci_span,

@@ -26,21 +26,20 @@ true series, even if agents observe forecasts with errors.
 To add a term, write a function with the decorator ``reward_term``; its name is the name of the
 term, and the first line of its docstring describes it in the documentation. Terms are compiled
 together, so they use arithmetic, the NumPy functions of ``kernels/compiler/stage.py``, and
-``np.where`` instead of branches on values. A quantity that is not in the result of a step needs a
-field in ``TermContext`` and its value in ``RewardContext``.
+``np.where`` instead of branches on values. A quantity that is not in the result of a step needs an
+attribute or a property of ``TermContext``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
-from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.types import F64, I64, StepResult
 from sdc_taichi.user_functions import is_replacement
 
@@ -62,31 +61,90 @@ HIGH_POWER_FACTOR = 40.0
 20 times the demand charge over the hours of a bill, 0.33 at 12 per kW."""
 
 
-@dataclass(frozen=True, slots=True)
+END_OF_DAY_START_H = 23.0
+"""Hour of the day from which queued tasks have a rising cost (paper, F.1)."""
+COMING_H = 24
+"""Hours of the mean intensity or price that values waiting work and stored energy."""
+
+
 class TermContext:
-    """Quantities for reward terms besides the result of the step."""
+    """Quantities for reward terms besides the result of the step, (B,) each.
+
+    Args:
+        bills: length of the episodes divided by the 30 days of a billing period.
+    """
 
     design_kwh: F64
-    """Energy of a step at the design point, in kWh, (B,)."""
-    demand_charge_per_kw: F64
-    """Price per kW of the highest power of a billing period, (B,)."""
-    peak_kw: F64
-    """Highest power of the episode before this step, at least half the design power, in kW,
-    (B,)."""
-    bills: float
-    """Length of the episode divided by the 30 days of a billing period."""
-    end_of_day_weight: F64
-    """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day, (B,)."""
+    """Energy of a step at the design point, in kWh."""
     task_kwh: F64
-    """IT energy of a task, which is 1 % of a step at full load, in kWh, (B,)."""
-    coming_ci_before: F64
-    """Mean carbon intensity of the 24 h from the beginning of the step, in g CO2e/kWh, (B,)."""
-    coming_ci: F64
-    """Mean carbon intensity of the 24 h from the end of the step, in g CO2e/kWh, (B,)."""
-    coming_price_before: F64
-    """Mean price of a kWh in the 24 h from the beginning of the step, (B,)."""
-    coming_price: F64
-    """Mean price of a kWh in the 24 h from the end of the step, (B,)."""
+    """IT energy of a task, which is 1 % of a step at full load, in kWh."""
+    demand_charge_per_kw: F64
+    """Price per kW of the highest power of a billing period."""
+    bills: F64
+    """Length of the episode divided by the 30 days of a billing period."""
+    peak_kw: F64
+    """Highest power of the episode before this step, at least half the design power, in kW."""
+
+    def __init__(self, bills: float) -> None:
+        self._bills = bills
+        self._index: I64 = np.zeros(0, dtype=np.int64)
+        # Series and its forward mean, by name.
+        self._means: dict[str, tuple[FleetSeries, FleetSeries]] = {}
+
+    def reset(self, view: View) -> None:
+        """Start an episode.
+
+        Args:
+            view: the view before the first step.
+        """
+        per_hour = view.fleet.steps_per_hour
+        self._drivers, self._coming_steps = view.drivers, COMING_H * per_hour
+        self._weight_of_step = _end_of_day_weight(np.arange(24 * per_hour), view.step_h)
+        self.design_kwh = view.sizing.facility_w * view.step_h / 1e3
+        self.task_kwh = view.sizing.it_w * view.step_h / (1e3 * TASKS_PER_STEP)
+        self.demand_charge_per_kw = view.fleet.values("tariff.demand_charge_per_kw")
+        self.bills = np.full(view.size, self._bills)
+
+    def begin_step(self, step: int, peak_kw: F64) -> None:
+        """Set the step that values belong to.
+
+        Args:
+            step: index of the step, 0 at reset.
+            peak_kw: highest power of the episode before it, in kW, (B,).
+        """
+        self._index, self.peak_kw = self._drivers.start + step, peak_kw
+
+    @property
+    def end_of_day_weight(self) -> F64:
+        """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day."""
+        return self._weight_of_step[self._index % len(self._weight_of_step)]
+
+    @property
+    def coming_ci_before(self) -> F64:
+        """Mean carbon intensity of the 24 h from the beginning of the step, in g CO2e/kWh."""
+        return self._coming("ci_g_per_kwh").at(self._index)
+
+    @property
+    def coming_ci(self) -> F64:
+        """Mean carbon intensity of the 24 h from the end of the step, in g CO2e/kWh."""
+        return self._coming("ci_g_per_kwh").at(self._index + 1)
+
+    @property
+    def coming_price_before(self) -> F64:
+        """Mean price of a kWh in the 24 h from the beginning of the step."""
+        return self._coming("price_per_kwh").at(self._index)
+
+    @property
+    def coming_price(self) -> F64:
+        """Mean price of a kWh in the 24 h from the end of the step."""
+        return self._coming("price_per_kwh").at(self._index + 1)
+
+    def _coming(self, name: str) -> FleetSeries:
+        """Forward mean of a series, computed again if the inputs have changed."""
+        series: FleetSeries = getattr(self._drivers, name)
+        if name not in self._means or self._means[name][0] is not series:
+            self._means[name] = series, coming_means(series, self._coming_steps)
+        return self._means[name][1]
 
 
 Term = Callable[[StepResult, TermContext], F64]
@@ -292,70 +350,6 @@ def terms_markdown() -> str:
     """The table of terms in docs/environments.md."""
     rows = [f"| `{n}` | {(t.__doc__ or '').split(chr(10))[0]} |" for n, t in TERMS.items()]
     return "\n".join(["| term | negative of |", "|---|---|", *rows])
-
-
-END_OF_DAY_START_H = 23.0
-"""Hour of the day from which queued tasks have a rising cost (paper, F.1)."""
-COMING_H = 24
-"""Hours of the mean intensity or price that values waiting work and stored energy."""
-COMING_SERIES = {"coming_ci": "ci_g_per_kwh", "coming_price": "price_per_kwh"}
-"""Series of the forward means in the context, by the name of the value."""
-
-
-class RewardContext:
-    """Values of ``TermContext`` from time, data centers and inputs."""
-
-    def __init__(self) -> None:
-        # Values that are constant in an episode.
-        self._fixed: dict[str, F64] = {}
-        self._drivers: Drivers | None = None
-        self._coming_steps = 0
-        # Source series and its forward mean, by name of the value.
-        self._means: dict[str, tuple[FleetSeries, FleetSeries]] = {}
-        # By step of the day.
-        self._end_of_day_weight = np.zeros(0)
-
-    def reset(self, view: View) -> None:
-        """Start an episode.
-
-        Args:
-            view: the view before the first step.
-        """
-        per_hour = view.fleet.steps_per_hour
-        self._drivers, self._coming_steps = view.drivers, COMING_H * per_hour
-        self._end_of_day_weight = _end_of_day_weight(np.arange(24 * per_hour), view.step_h)
-        self._fixed = {
-            "design_kwh": view.sizing.facility_w * view.step_h / 1e3,
-            "task_kwh": view.sizing.it_w * view.step_h / (1e3 * TASKS_PER_STEP),
-            "demand_charge_per_kw": view.fleet.values("tariff.demand_charge_per_kw"),
-        }
-
-    def values(self, step: int, names: Iterable[str]) -> dict[str, F64]:
-        """Values of a step by name, (B,) each.
-
-        Args:
-            step: index of the step, 0 at reset.
-            names: names of fields of ``TermContext``.
-        """
-        return {name: self._value(step, name) for name in names}
-
-    def _value(self, step: int, name: str) -> F64:
-        if name in self._fixed:
-            return self._fixed[name]
-        assert self._drivers is not None, "reset comes first"
-        index = self._drivers.start + step
-        if name == "end_of_day_weight":
-            return self._end_of_day_weight[index % len(self._end_of_day_weight)]
-        series_name = name.removesuffix("_before")
-        after = 0 if name.endswith("_before") else 1
-        return self._coming(series_name, self._drivers).at(index + after)
-
-    def _coming(self, name: str, drivers: Drivers) -> FleetSeries:
-        """Forward mean of a series, computed again if the inputs have changed."""
-        series: FleetSeries = getattr(drivers, COMING_SERIES[name])
-        if name not in self._means or self._means[name][0] is not series:
-            self._means[name] = series, coming_means(series, self._coming_steps)
-        return self._means[name][1]
 
 
 def _end_of_day_weight(step_of_day: I64, step_h: float) -> F64:

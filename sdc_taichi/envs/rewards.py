@@ -7,17 +7,14 @@ takes the function, the name under which ``register_reward`` registered it, or i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
-from sdc_taichi.envs.features import NotedReads
 from sdc_taichi.envs.released import ReleasedRewards
-from sdc_taichi.envs.reward_terms import TERMS, RewardContext, TermContext
+from sdc_taichi.envs.reward_terms import TERMS, TermContext
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
 from sdc_taichi.types import F64, StepResult
@@ -48,9 +45,6 @@ MAX_PEAK_KW = POWER_LIMITS_W[1] / 1e3
 """Highest power that can be billed, in kW."""
 BILL_DAYS = 30.0
 """Days between two bills."""
-
-_FIELDS_OF_REWARDS = ("peak_kw", "bills")
-"""Fields of ``TermContext`` that ``Rewards`` supplies; ``RewardContext`` supplies all others."""
 
 _registered: dict[str, RewardFunction] = {}
 
@@ -97,7 +91,6 @@ class Rewards:
         days: float,
     ) -> None:
         self._collaboration, self._agents = collaboration, tuple(agents)
-        self._bills = days / BILL_DAYS
         self._released: ReleasedRewards | None = None
         self._function: RewardFunction | None = None
         self._scales: dict[str, dict[str, float]] = {}
@@ -120,9 +113,7 @@ class Rewards:
         used = {name for scales in self._scales.values() for name in scales}
         self.used_terms = [name for name in TERMS if name in used]
         self._stage: Any = None
-        self._quantities_read: tuple[str, ...] = ()
-        self._context = RewardContext()
-        self._context_read: tuple[str, ...] = ()
+        self._context = TermContext(days / BILL_DAYS)
         # Highest billed power before and after the last step, in kW, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
         self._step_h = 0.0
@@ -160,12 +151,11 @@ class Rewards:
         self._peak_before_kw = self._peak_kw
         if self._scales:
             if self._stage is None:
-                self._compile(result)
-            by_agent: dict[str, F64] = self._stage(
-                peak_before_kw=self._peak_before_kw,
-                **self._context.values(result.step, self._context_read),
-                **{name: getattr(result, name) for name in self._quantities_read},
-            )
+                from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+                self._stage = CompiledStage(self._stage_function, view.size)
+            self._context.begin_step(result.step, self._peak_before_kw)
+            by_agent: dict[str, F64] = self._stage(context=self._context, result=result)
             self._peak_kw = by_agent.pop("peak_kw")
             return by_agent, by_agent.pop("joint")
         self._peak_kw = _peak_kw(self._peak_kw, result)
@@ -180,13 +170,8 @@ class Rewards:
 
     def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
         """Unscaled terms of the last step by name, (B,) each, used by the rewards or not."""
-        in_context = [f.name for f in fields(TermContext) if f.name not in _FIELDS_OF_REWARDS]
-        context = TermContext(
-            peak_kw=self._peak_before_kw,
-            bills=self._bills,
-            **self._context.values(result.step, in_context),
-        )
-        return {name: TERMS[name](result, context) for name in names}
+        self._context.begin_step(result.step, self._peak_before_kw)
+        return {name: TERMS[name](result, self._context) for name in names}
 
     def peaks_kw(self) -> F64:
         """Highest billed power of the episode before and after the last step, in kW, (2, B)."""
@@ -196,35 +181,31 @@ class Rewards:
         """Restore the result of ``peaks_kw``, (2, B), in an episode that has been reset."""
         self._peak_before_kw, self._peak_kw = peaks_kw.copy()
 
-    def _compile(self, result: StepResult) -> None:
-        """Find out which quantities of a step the terms read, and compile the terms."""
-        from sdc_taichi.kernels.compiler.stage import CompiledStage
-
-        quantities, context = NotedReads(), NotedReads()
-        for name in self.used_terms:
-            TERMS[name](quantities, context)  # type: ignore[arg-type]
-        _peak_kw(self._peak_kw, quantities)  # type: ignore[arg-type]
-        self._quantities_read = tuple(quantities.names)
-        self._context_read = tuple(n for n in context.names if n not in _FIELDS_OF_REWARDS)
-        self._stage = CompiledStage(self._stage_function, result.grid_kwh.size)
-
-    def _stage_function(self, peak_before_kw: F64, **read: Any) -> dict[str, F64]:
+    def _stage_function(self, context: Any, result: Any) -> dict[str, F64]:
         """Rewards by learning agent, ``joint`` and ``peak_kw`` of a step, (B,) each."""
-        in_context = {name: read.pop(name) for name in self._context_read}
-        context: Any = SimpleNamespace(peak_kw=peak_before_kw, bills=self._bills, **in_context)
-        result: Any = SimpleNamespace(step_h=self._step_h, **read)
+        result = _WithStep(result, self._step_h)
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
         individual = [_weighed(terms, self._scales[agent]) for agent in AGENTS]
         by_agent, joint = _with_sum(self._shared(individual))
         if self._joint_scales:
             joint = _weighed(terms, self._joint_scales)
-        return by_agent | {"joint": joint, "peak_kw": _peak_kw(peak_before_kw, result)}
+        return by_agent | {"joint": joint, "peak_kw": _peak_kw(context.peak_kw, result)}
 
     def _shared(self, individual: Sequence[F64]) -> dict[str, F64]:
         """Collaborative rewards by learning agent, from the individual rewards of ``AGENTS``."""
         shared = collaborative_rewards(individual, self._collaboration)
         by_agent = dict(zip(AGENTS, shared, strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
+
+
+class _WithStep:
+    """A traced result of a step, and the length of the step, in h, which is no array."""
+
+    def __init__(self, result: Any, step_h: float) -> None:
+        self._result, self.step_h = result, step_h
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)
 
 
 def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:

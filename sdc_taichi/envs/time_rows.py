@@ -81,9 +81,6 @@ class TimeRows:
 
         Args:
             view: the view before the first step.
-
-        Raises:
-            ConfigError: forecasts that err in a view without random walks.
         """
         drivers = view.drivers
         has_year = self._steps.stop == _ENDLESS
@@ -212,14 +209,9 @@ class Forecasts:
 
         Returns:
             Whether the series differ from those of the episode before.
-
-        Raises:
-            ConfigError: forecasts that err in a view without random walks.
         """
         drivers, self._error, self._walks = view.drivers, view.forecast_error, view.walks
         self.are_perfect = self._error == PERFECT
-        if not self.are_perfect and self._walks is None:
-            raise ConfigError("forecasts err in a view without walks; valid is one of view_maker")
         physical = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, drivers.demand)
         if self.series and all(map(operator.is_, physical, (*self.series[:3], self.series[4]))):
             return False

@@ -17,9 +17,9 @@ from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.tables import (
     FacilityTable,
     Nodes,
-    TableGrid,
     barred,
     batches,
+    setpoints_c,
     tabulate,
     what_decides_facility,
 )
@@ -187,10 +187,14 @@ def facility_map(
     dcs = [keys.index(key) for key in entries]
     reach = _ranges(fleet, drivers, which, by_wet_bulb, margin_k)
     weather = _weather_nodes(*reach, weather_step_k, fleet.models["plant"])
-    grid = TableGrid(utilisations, setpoint_step_k)
     levels = np.linspace(0.0, 1.0, utilisations)
-    setpoints = max(len(grid.setpoint_c(fleet.configs[dc])) for dc in dcs)
-    nodes = [Nodes(dc, levels, _setpoint_c(fleet, dc, grid, setpoints)) for dc in dcs]
+    of_each = [setpoints_c(fleet.configs[dc], setpoint_step_k) for dc in dcs]
+    setpoints = max(map(len, of_each))
+    # The highest setpoint is repeated to the number of all.
+    nodes = [
+        Nodes(dc, levels, np.pad(x, (0, setpoints - len(x)), mode="edge"))
+        for dc, x in zip(dcs, of_each, strict=True)
+    ]
     tables: list[FacilityTable] = []
     for part in batches(fleet, nodes):
         own = slice(len(tables), len(tables) + len(part))
@@ -267,12 +271,6 @@ def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, float(inlet_limit_c[dc])
-
-
-def _setpoint_c(fleet: Fleet, dc: int, grid: TableGrid, number: int) -> F64:
-    """Setpoints of a data center, the highest as often as makes up the number, in C, (J,)."""
-    own = grid.setpoint_c(fleet.configs[dc])
-    return np.pad(own, (0, number - len(own)), mode="edge")
 
 
 def _ranges(

@@ -121,7 +121,7 @@ def roll_out(
     steps = len(targets.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
         sim.reset(seed, start=start)
-        follower = Follower(fleet, drivers, sim.sizing, targets)
+        follower = Follower(fleet, sim.drivers, sim.sizing, targets)
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
         for t in range(steps):
@@ -138,7 +138,7 @@ class Follower:
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs.
+        drivers: Their inputs, with the first step of the run.
         sizing: Capacities of their devices.
         targets: States that they are to reach.
     """

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.plant.plants import PLANTS
@@ -81,36 +80,19 @@ OnStep = Callable[[int, int], None]
 work."""
 
 
-@dataclass(frozen=True, slots=True)
-class TableGrid:
-    """Where tables have their nodes."""
+def setpoints_c(config: DataCenterConfig, step_k: float | None = None) -> F64:
+    """Setpoints of tables from the lowest to the highest of a data center, in C, (J,).
 
-    utilisations: int | None = None
-    """Number of utilisations, evenly from 0 to 1, 2..1,001; None is the least of ``UTILISATIONS``
-    that is fine enough for the hall, see ``MOST_ERROR``."""
-    setpoint_step_k: float | None = None
-    """Largest distance of setpoints, in K, 0.01..50; None is 0.5 K with a tower, and half of that
-    for plants without, whose energy bends more along the setpoint."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: One that is out of bounds.
-        """
-        if self.utilisations is not None:
-            whole_number("table: utilisations", self.utilisations, 2, 1001)
-        step_k = self.setpoint_step_k
-        if step_k is not None and not 0.01 <= step_k <= 50.0:
-            raise ConfigError(f"table: setpoint_step_k {step_k:g}; valid is 0.01..50")
-
-    def setpoint_c(self, config: DataCenterConfig) -> F64:
-        """Setpoints from the lowest to the highest of a data center, in C, (J,)."""
-        setpoint, step_k = config.hvac.setpoint, self.setpoint_step_k
-        if step_k is None:
-            step_k = 0.25 if PLANTS[config.hvac.plant_in_use].dry else 0.5
-        intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / step_k - 1e-9))
-        return np.linspace(setpoint.min_c, setpoint.max_c, intervals + 1)
+    Args:
+        config: The data center.
+        step_k: Largest distance of setpoints, in K; None is 0.5 K with a tower, and half of that
+            for plants without, whose energy bends more along the setpoint.
+    """
+    setpoint = config.hvac.setpoint
+    if step_k is None:
+        step_k = 0.25 if PLANTS[config.hvac.plant_in_use].dry else 0.5
+    intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / step_k - 1e-9))
+    return np.linspace(setpoint.min_c, setpoint.max_c, intervals + 1)
 
 
 def facility_tables(
@@ -119,7 +101,8 @@ def facility_tables(
     *,
     start: I64,
     steps: int,
-    grid: TableGrid = TableGrid(),
+    utilisations: int | None = None,
+    setpoint_step_k: float | None = None,
     precision: Precision = "f32",
     on_step: OnStep | None = None,
 ) -> list[FacilityTable]:
@@ -134,7 +117,9 @@ def facility_tables(
         drivers: Their inputs, whose design temperatures size the devices.
         start: First step of each data center, counted from the beginning of the year, (B,).
         steps: Number of steps, T.
-        grid: Where the tables have their nodes.
+        utilisations: Number of utilisations, evenly from 0 to 1; None is the least of
+            ``UTILISATIONS`` that is fine enough for the hall, see ``MOST_ERROR``.
+        setpoint_step_k: Largest distance of setpoints, as of ``setpoints_c``.
         precision: Of the server kernels.
         on_step: Called after every step of a batch of data centers.
 
@@ -150,7 +135,13 @@ def facility_tables(
     ]
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
-    nodes = _nodes(fleet, drivers, distinct, start, steps, grid, precision)
+    counts = [utilisations or 0] * len(distinct)
+    if utilisations is None:
+        counts = _fine_enough(fleet, drivers, distinct, start, steps, precision)
+    nodes = [
+        Nodes(dc, np.linspace(0.0, 1.0, count), setpoints_c(fleet.configs[dc], setpoint_step_k))
+        for dc, count in zip(distinct, counts, strict=True)
+    ]
     for batch in batches(fleet, nodes):
         outdoor_c, wet_bulb_c = (
             _series_of(series, batch, start, steps)
@@ -267,26 +258,6 @@ def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashab
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
-
-
-def _nodes(
-    fleet: Fleet,
-    drivers: Drivers,
-    which: Sequence[int],
-    start: I64,
-    steps: int,
-    grid: TableGrid,
-    precision: Precision,
-) -> list[Nodes]:
-    """Nodes of some data centers; arguments as of ``facility_tables``."""
-    if grid.utilisations is None:
-        counts = _fine_enough(fleet, drivers, which, start, steps, precision)
-    else:
-        counts = [grid.utilisations] * len(which)
-    return [
-        Nodes(dc, np.linspace(0.0, 1.0, count), grid.setpoint_c(fleet.configs[dc]))
-        for dc, count in zip(which, counts, strict=True)
-    ]
 
 
 def _fine_enough(

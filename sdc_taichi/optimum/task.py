@@ -11,7 +11,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.cache import key_of
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
-from sdc_taichi.optimum.tables import UTILISATIONS, OnStep, TableGrid, facility_tables
+from sdc_taichi.optimum.tables import UTILISATIONS, OnStep, facility_tables, setpoints_c
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -74,9 +74,9 @@ class Task:
         Args:
             where: numbers of the data centers to divide.
         """
-        grid, part, size = TableGrid(), list[int](), 0.0
+        part, size = list[int](), 0.0
         for i in where:
-            nodes = UTILISATIONS[0] * len(grid.setpoint_c(self.fleet.configs[i]))
+            nodes = UTILISATIONS[0] * len(setpoints_c(self.fleet.configs[i]))
             own = 4.0 * 8.0 * self.steps * nodes
             if part and size + own > MOST_TABLE_BYTES:
                 yield part
