@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -68,25 +67,6 @@ def test_no_heat_and_no_airflow_have_defined_indices() -> None:
         found = air_metrics.shi(np.array([4e-15]), np.array([left]), 1.0)
         np.testing.assert_array_equal(found, [0.0])
         np.testing.assert_array_equal(air_metrics.rti(np.array([18.5]), 18.0, left), [0.0])
-
-
-@given(
-    st.lists(st.integers(1, 40), min_size=1, max_size=6),
-    st.integers(0, 2**32 - 1),
-)
-def test_a_data_center_alone_has_the_sums_of_the_batch(sizes: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    start = np.concatenate([[0], np.cumsum(sizes)])
-    flow_m3s = rng.uniform(0.0, 5.0, start[-1])
-    air_c = rng.uniform(10.0, 45.0, start[-1])
-    supply_c = rng.uniform(14.0, 22.0, len(sizes))
-    rise = air_metrics.rise_m3k_s(flow_m3s, air_c, supply_c, start)
-    for i, (low, high) in enumerate(itertools.pairwise(start)):
-        alone = np.array([0, high - low])
-        own = slice(low, high)
-        assert rise[i] == air_metrics.rise_m3k_s(
-            flow_m3s[own], air_c[own], supply_c[i : i + 1], alone
-        )
 
 
 @given(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,8 +33,8 @@ class Case:
             count=self.count,
             capacity=self.capacity,
             inlet_c=self.inlet_c,
-            limit_c=LIMIT_C,
-            weights=self.weights,
+            limit_c=np.full(len(self.start) - 1, LIMIT_C),
+            weights=self.weights if policy == "weights" else None,
         )
 
     def alone(self, dc: int) -> Case:
@@ -202,34 +201,22 @@ def test_a_data_center_without_capacity_places_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("policy", "changes", "message"),
+    ("weights", "message"),
     [
-        ("weights", {"weights": None}, "placement weights: none given"),
-        ("weights", {"weights": np.ones(3)}, r"shape \(3,\), expected \(4,\)"),
-        (
-            "weights",
-            {"weights": [1.0, 1.0, 1.0, -2.0]},
-            "oslo: placement weight 1 is -2.0; valid is a finite number",
-        ),
-        ("weights", {"weights": [1.0, np.nan, 1.0, 1.0]}, "bergen: placement weight 1 is nan"),
-        (
-            "weights",
-            {"weights": [1.0, 0.0, 0.0, 0.0]},
-            "oslo: all placement weights are 0; valid is at least one above 0",
-        ),
-        ("even", {}, "placement 'even': valid are uniform, fill"),
-        ("inlet-aware", {"limit_c": np.array([27.0, np.inf])}, "oslo: .* limit of inf C"),
+        ([1.0, 1.0, 1.0, -2.0], "oslo: placement weight 1 is -2.0; valid is a finite number"),
+        ([1.0, np.nan, 1.0, 1.0], "bergen: placement weight 1 is nan"),
+        ([1.0, 0.0, 0.0, 0.0], "oslo: all placement weights are 0; valid is at least one above 0"),
     ],
 )
-def test_values_that_cannot_be_used_are_named(
-    policy: str, changes: dict[str, Any], message: str
-) -> None:
-    values: dict[str, Any] = {
-        "count": np.ones(4),
-        "capacity": np.ones(4),
-        "inlet_c": np.full(4, 20.0),
-        "limit_c": LIMIT_C,
-    }
-    bins = make_bins(np.array([0, 2, 4]), ["bergen", "oslo"])
+def test_weights_that_cannot_be_used_are_named(weights: list[float], message: str) -> None:
     with pytest.raises(PlacementError, match=message):
-        place(policy, np.array([0.5, 0.5]), bins=bins, **{**values, **changes})
+        place(
+            "weights",
+            np.array([0.5, 0.5]),
+            bins=make_bins(np.array([0, 2, 4]), ["bergen", "oslo"]),
+            count=np.ones(4),
+            capacity=np.ones(4),
+            inlet_c=np.full(4, 20.0),
+            limit_c=np.full(2, LIMIT_C),
+            weights=np.array(weights),
+        )

@@ -7,7 +7,6 @@ and flows make these sums from racks.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from sdc_taichi.kernels import hall_arguments
 from sdc_taichi.types import F64, Reals, Values, as_array
@@ -50,33 +49,18 @@ def rank(temperature_c: Reals) -> F64:
     return np.asarray(np.floor(temperature_c * hall_arguments.RANKS_PER_K + 0.5))
 
 
-def rise_m3k_s(
-    airflow_m3s: Reals,
-    temperature_c: Reals,
-    supply_c: Values,
-    rack_offsets: npt.NDArray[np.integer] | None = None,
-) -> F64:
+def rise_m3k_s(airflow_m3s: Reals, temperature_c: Reals, supply_c: Values) -> F64:
     """Flow-weighted temperature above the supply air, sum V*(T - T_sup); times rho*cp it is heat.
 
-    With sums alone it is sum(V*T) - T_sup*sum(V).
-
     Args:
-        airflow_m3s: Airflow of each rack, m3/s, (..., N), or (R,) with ``rack_offsets``.
+        airflow_m3s: Airflow of each rack, m3/s, (..., N).
         temperature_c: Inlet or outlet temperature of each rack, C, same shape.
-        supply_c: Supply air, C, one for all, (..., 1) or per rack; with ``rack_offsets`` also (B,).
-        rack_offsets: First rack of each data center, and the number of racks, (B + 1,); each data
-            center has a rack or more.
+        supply_c: Supply air, C, one for all or (..., 1).
 
     Returns:
-        Sum over the racks, m3 K/s, (...) or (B,).
+        Sum over the racks, m3 K/s, (...).
     """
-    supply = np.asarray(supply_c, dtype=np.float64)
-    if rack_offsets is not None and supply.shape == (len(rack_offsets) - 1,):
-        supply = np.repeat(supply, np.diff(rack_offsets))
-    rise = airflow_m3s * (temperature_c - supply)
-    if rack_offsets is None:
-        return np.asarray(rise.sum(axis=-1))
-    return np.asarray(np.add.reduceat(rise, rack_offsets[:-1]))
+    return np.asarray((airflow_m3s * (temperature_c - supply_c)).sum(axis=-1))
 
 
 def over_27_sum_k(inlet_c: F64) -> F64:

@@ -95,7 +95,7 @@ class MixWeights:
             yield rack[:runs], first_rack[:runs] + i, self.weights[first_weight[:runs] + i]
 
 
-_Runs = tuple[I32, I32, I32, I32]
+_Runs = tuple[I32, ...]
 """``run_offsets``, ``run_first_rack``, ``run_length`` and ``run_first_weight``."""
 
 
@@ -255,10 +255,8 @@ def _reach_m(hall: HallConfig) -> float:
         across = _across_m(hall.layout, parity, shifts)[:, None]
         path_m = _path_m(hall, x[len(x) // 2], x, across, _row_ends_m(hall))
         total = _path_weights(hall, path_m, path_m.min()).sum()
-        nearest_m = path_m.min()
-        reach_m = min(
-            reach_m, float(nearest_m - hall.recirculation.decay_m * np.log(cutoff * total))
-        )
+        beyond_nearest_m = -hall.recirculation.decay_m * np.log(cutoff * total)
+        reach_m = min(reach_m, float(path_m.min() + beyond_nearest_m))
     return reach_m
 
 
@@ -344,10 +342,10 @@ def _merged_runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
     first_shift, last_shift = _shift_bounds(hall, window, row)
     first_weight = blocks.first_weight[row % 2, place] + (first_shift + row_reach) * per_row
     return _as_runs(
-        run_offsets=np.arange(hall.racks + 1),
-        first_rack=(row + first_shift) * per_row,
-        length=(last_shift - first_shift + 1) * per_row,
-        first_weight=first_weight,
+        np.arange(hall.racks + 1),
+        (row + first_shift) * per_row,
+        (last_shift - first_shift + 1) * per_row,
+        first_weight,
     )
 
 
@@ -366,19 +364,10 @@ def _runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
     end = blocks.end_near[row % 2, place, shift + row_reach]
     width = (window.end_place - window.first_place)[place]
     first_weight = blocks.first_weight[row % 2, place] + (shift + row_reach) * width + begin
-    return _as_runs(
-        run_offsets=run_offsets,
-        first_rack=(row + shift) * per_row + window.first_place[place] + begin,
-        length=end - begin,
-        first_weight=first_weight,
-    )
+    first_rack = (row + shift) * per_row + window.first_place[place] + begin
+    return _as_runs(run_offsets, first_rack, end - begin, first_weight)
 
 
-def _as_runs(*, run_offsets: I64, first_rack: I64, length: I64, first_weight: I64) -> _Runs:
-    """Runs as the 32-bit integers that the kernels take."""
-    return (
-        run_offsets.astype(np.int32),
-        first_rack.astype(np.int32),
-        length.astype(np.int32),
-        first_weight.astype(np.int32),
-    )
+def _as_runs(*values: I64) -> _Runs:
+    """Values of ``_Runs`` as the 32-bit integers that the kernels take."""
+    return tuple(each.astype(np.int32) for each in values)

@@ -107,8 +107,8 @@ def place(
     count: F64,
     capacity: F64,
     inlet_c: F64,
-    limit_c: npt.ArrayLike,
-    weights: npt.ArrayLike | None = None,
+    limit_c: F64,
+    weights: F64 | None = None,
 ) -> tuple[F64, F64]:
     """Spread the utilisation of each data center over its bins.
 
@@ -127,13 +127,13 @@ def place(
     work suffices.
 
     Args:
-        policy: One of ``POLICIES``.
+        policy: Name of a policy, see above.
         utilisation: Work as a share of all servers, at least 0, (B,).
         bins: Bins of the fleet, see ``make_bins``.
         count: Servers of each bin, above 0, (n,).
         capacity: Utilisation each bin may reach, 0..1, (n,).
         inlet_c: Last known inlet temperature of each bin, C, (n,).
-        limit_c: Inlet temperature that ``inlet-aware`` keeps away from, C, finite, () or (B,).
+        limit_c: Inlet temperature that ``inlet-aware`` keeps away from, C, (B,).
         weights: Relative loads, at least 0 and above 0 for a bin or more of each data center, (n,);
             for ``weights`` alone.
 
@@ -143,18 +143,15 @@ def place(
         may be used. sum(count*load) = placed*sum(count) to rounding.
 
     Raises:
-        PlacementError: an unknown policy, a limit that is not finite, or weights that are missing,
-            of the wrong shape, negative, not finite, or all 0 in a data center.
+        PlacementError: weights that are negative, not finite, or all 0 in a data center.
     """
-    if policy not in POLICIES:
-        raise PlacementError(f"placement {policy!r}: valid are {', '.join(POLICIES)}")
     if policy == "uniform":
         return _uniform(utilisation, bins, count, capacity)
     weight = np.ones(len(count))
-    if policy == "weights":
-        weight = _checked_weights(weights, bins)
+    if weights is not None:
+        weight = _relative_weights(weights, bins)
     elif policy == "inlet-aware":
-        weight = np.maximum(_checked_limit(limit_c, bins)[bins.dc] - inlet_c, MIN_HEADROOM_K)
+        weight = np.maximum(limit_c[bins.dc] - inlet_c, MIN_HEADROOM_K)
     usable = np.where(weight > 0.0, capacity, 0.0)
     placed, work, full = _placeable(utilisation, bins, count, usable)
     if policy in ("fill", "coolest-first"):
@@ -221,30 +218,8 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
     return np.where(full, capacity, np.clip(level[bins.dc] * weight, 0.0, capacity))
 
 
-def _checked_limit(limit_c: npt.ArrayLike, bins: Bins) -> F64:
-    """Limit of each data center, in C, (B,)."""
-    limit = np.broadcast_to(np.asarray(limit_c, dtype=np.float64), (len(bins.offsets) - 1,))
-    wrong = np.flatnonzero(~np.isfinite(limit))
-    if len(wrong):
-        raise PlacementError(
-            f"{bins.names[wrong[0]]}: placement inlet-aware with a limit of {limit[wrong[0]]} C; "
-            "valid is a finite temperature"
-        )
-    return limit
-
-
-def _checked_weights(weights: npt.ArrayLike | None, bins: Bins) -> F64:
-    """Weights over the largest of their data center, (n,)."""
-    if weights is None:
-        raise PlacementError("placement weights: none given; valid is one per bin")
-    try:
-        values = np.asarray(weights, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise PlacementError(f"placement weights {weights!r}: valid are numbers") from None
-    if values.shape != bins.dc.shape:
-        raise PlacementError(
-            f"placement weights: shape {values.shape}, expected {bins.dc.shape}, one per bin"
-        )
+def _relative_weights(values: F64, bins: Bins) -> F64:
+    """Weights divided by the largest of their data center, (n,)."""
     wrong = np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))
     if len(wrong):
         dc = bins.dc[wrong[0]]

@@ -102,12 +102,16 @@ def solve(
         cell_m: Longest cell, m.
 
     Raises:
-        ConfigError: values out of range, or too many cells or racks.
+        ConfigError: a cell length out of range, or too many cells or racks.
         SdcError: a system that cannot be solved to the tolerance.
     """
     begun = time.perf_counter()
-    airflow_m3s, power_w = _checked(config, airflow_m3s, power_w, supply_m3s, supply_c)
     hall = config.hall
+    if hall.racks > MOST_MATRIX_RACKS:
+        raise ConfigError(
+            f"{config.name}: {hall.racks:,} racks; the layout solver takes at most "
+            f"{MOST_MATRIX_RACKS:,}, the largest matrix that a hall can use"
+        )
     grid = build_grid(hall, airflow_m3s, supply_m3s, cell_m)
     air = _GridAir(grid, airflow_m3s)
     mass_residual = air.find_flow() / supply_m3s
@@ -387,37 +391,6 @@ def solve_at_design_point(
         supply_c=design.supply_c,
         cell_m=cell_m,
     )
-
-
-def _checked(
-    config: DataCenterConfig, airflow_m3s: F64, power_w: F64, supply_m3s: float, supply_c: float
-) -> tuple[F64, F64]:
-    """Airflow and power of the racks as arrays, (R,), once all arguments of ``solve`` are valid."""
-    racks = config.hall.racks
-    if racks > MOST_MATRIX_RACKS:
-        raise ConfigError(
-            f"{config.name}: {racks:,} racks; the layout solver takes at most "
-            f"{MOST_MATRIX_RACKS:,}, the largest matrix that a hall can use"
-        )
-    for name, value, want in (
-        ("supply_m3s", supply_m3s, "a finite number above 0"),
-        ("supply_c", supply_c, "a finite number"),
-    ):
-        if not np.isfinite(value) or (name == "supply_m3s" and value <= 0):
-            raise ConfigError(f"{name} is {value:g}; valid is {want}")
-    return _per_rack("airflow_m3s", airflow_m3s, racks), _per_rack("power_w", power_w, racks)
-
-
-def _per_rack(name: str, numbers: F64, racks: int) -> F64:
-    """Values of the racks, (R,), if they are finite numbers above 0."""
-    values: F64 = np.ascontiguousarray(numbers, dtype=np.float64)
-    if values.shape != (racks,):
-        raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
-    valid = np.isfinite(values) & (values > 0)
-    if not valid.all():
-        rack = int(np.argmin(valid))
-        raise ConfigError(f"{name}[{rack}] is {values[rack]:g}; valid is a finite number above 0")
-    return values
 
 
 def _provenance(

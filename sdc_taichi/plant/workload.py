@@ -69,17 +69,7 @@ def fluid(point: WorkPoint) -> Work:
         point.waiting - forced, np.maximum(point.command, 0.0) * (capacity - now - forced)
     )
     started = now + forced + drained
-    return Work(
-        utilisation=started / TASKS_PER_STEP,
-        arrived_tasks=arrived,
-        started_tasks=started,
-        deferred_tasks=deferred,
-        drained_tasks=drained,
-        due_tasks=point.due,
-        overdue_tasks=point.due - forced,
-        dropped_tasks=held_back - deferred,
-        dequeued_tasks=forced + drained,
-    )
+    return _work(point, arrived, started, forced, deferred, held_back - deferred, drained)
 
 
 def tasks(point: WorkPoint) -> Work:
@@ -102,6 +92,19 @@ def tasks(point: WorkPoint) -> Work:
     drainable = np.minimum(np.minimum(point.waiting - forced, flexible), free)
     drained = np.floor(np.maximum(point.command, 0.0) * drainable)
     started = arrived - deferred + forced + drained
+    return _work(point, arrived, started, forced, deferred, held_back - deferred, drained)
+
+
+def _work(
+    point: WorkPoint,
+    arrived: F64,
+    started: F64,
+    forced: F64,
+    deferred: F64,
+    dropped: F64,
+    drained: F64,
+) -> Work:
+    """Result of a step, in tasks; ``forced`` is the due work that runs, ``drained`` other work."""
     return Work(
         utilisation=started / TASKS_PER_STEP,
         arrived_tasks=arrived,
@@ -110,7 +113,7 @@ def tasks(point: WorkPoint) -> Work:
         drained_tasks=drained,
         due_tasks=point.due,
         overdue_tasks=point.due - forced,
-        dropped_tasks=held_back - deferred,
+        dropped_tasks=dropped,
         dequeued_tasks=forced + drained,
     )
 
