@@ -11,7 +11,7 @@ import pytest
 from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint, BatteryResult
 from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters, ChillerPoint, ChillerResult
 from sdc_taichi.plant.workload import MODELS, WorkPoint
-from sdc_taichi.types import Work
+from sdc_taichi.types import Work, fields_of
 
 
 def chiller_step(name: str, load_w: Any, **values: Any) -> ChillerResult:
@@ -41,8 +41,7 @@ def floating_point_errors() -> Iterator[None]:
 
 def assert_batch(result: Any, alone: Callable[[slice], Any]) -> None:
     """Assert that results are finite f64 of five data centers, each the same alone."""
-    for field in result._fields if hasattr(result, "_fields") else result.__slots__:
-        values = getattr(result, field)
+    for field, values in fields_of(result).items():
         assert (values.shape, values.dtype) == ((5,), np.float64)
         assert np.isfinite(values).all()
         for i in range(5):

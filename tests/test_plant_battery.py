@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from model_steps import assert_batch, battery_step, floating_point_errors  # noqa: F401
 from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 
-FIELDS = BatteryResult.__slots__
+FIELDS = tuple(f.name for f in fields(BatteryResult))
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
 five: dict[str, Any] = {"min_size": 5, "max_size": 5}

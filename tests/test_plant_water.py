@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,16 @@ from hypothesis import strategies as st
 from model_steps import assert_batch, floating_point_errors  # noqa: F401
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import moist_air
-from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
+from sdc_taichi.plant.water import WATER, WaterPoint
+from sdc_taichi.types import WaterQuantities
 
-FIELDS = WaterUse.__slots__
+FIELDS = tuple(f.name for f in fields(WaterQuantities))
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
 five: dict[str, Any] = {"min_size": 5, "max_size": 5}
 
 
-def run(name: str, **changes: Any) -> WaterUse:
+def run(name: str, **changes: Any) -> WaterQuantities:
     arguments: dict[str, Any] = {
         "rejected_w": 1e6,
         "range_k": 5.56,

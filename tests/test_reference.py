@@ -44,7 +44,7 @@ from sdc_taichi.plant import chiller, cooling, tower, water, workload
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
 from sdc_taichi.sim.sizing import released_ranges
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, WaterQuantities
 from work_steps import work_step
 
 Check = dict[str, Any]
@@ -542,7 +542,7 @@ def check_fan_cube(check: Check) -> Values:
     return {"P": tower.fan_power_w(ratio, design_fan_w=given["P_ref"])}
 
 
-def _water_l(model: str, **given: Any) -> water.WaterUse:
+def _water_l(model: str, **given: Any) -> WaterQuantities:
     needed = {
         "rejected_w": 0.0,
         "range_k": 0.0,

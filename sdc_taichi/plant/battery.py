@@ -23,26 +23,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdc_taichi.types import F64, Values
+from sdc_taichi.types import F64, BatteryQuantities, Values
 
 _ROUND_OFF_SHARE = 1e-12
 """Share of the stored energy that rounding may leave in a battery that is emptied exactly."""
 
 
-@dataclass(frozen=True, slots=True)
-class BatteryResult:
+@dataclass
+class BatteryResult(BatteryQuantities):
     """One step of the batteries of B data centers."""
 
-    stored_kwh: F64
-    """Energy in the battery at the end of the step, in kWh, (B,)."""
-    charge_kwh: F64
-    """Energy drawn from the bus into the battery, in kWh, (B,)."""
-    discharge_kwh: F64
-    """Energy that the battery delivers to the load, in kWh, (B,)."""
-    battery_loss_kwh: F64
-    """Energy lost, charge minus discharge minus the rise of the stored energy, in kWh, (B,)."""
     grid_kwh: F64
-    """Energy bought, load plus charge minus discharge, in kWh, (B,), at least 0."""
+    """Energy to buy, load plus charge minus discharge, in kWh, (B,), at least 0."""
 
 
 class BatteryParameters(NamedTuple):

@@ -7,13 +7,12 @@ counts as one litre.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from sdc_taichi.plant import moist_air
-from sdc_taichi.types import F64, Values
+from sdc_taichi.types import Values, WaterQuantities
 
 EVAPORATION_HEAT_J_PER_KG = 2.45e6
 """Heat of evaporation of water near 20 C, in J/kg."""
@@ -22,20 +21,6 @@ MAX_EVAPORATION_PER_K = 0.002
 factor" evaporation)."""
 PAPER_DRIFT_RATE = 0.01
 """Drift of the paper and its code, as a share of the water used, not of the water circulated."""
-
-
-@dataclass(frozen=True, slots=True)
-class WaterUse:
-    """Water that the cooling towers of B data centers use in one step."""
-
-    evaporation_l: F64
-    """Water that evaporates, in litres, (B,)."""
-    drift_l: F64
-    """Water that the air carries out as droplets, in litres, (B,)."""
-    blowdown_l: F64
-    """Water drained to hold the concentration of solids, in litres, (B,)."""
-    water_l: F64
-    """Make-up water, evaporation plus drift plus blowdown, in litres, (B,)."""
 
 
 class WaterPoint(NamedTuple):
@@ -67,7 +52,7 @@ class WaterPoint(NamedTuple):
     """Length of the step, in s."""
 
 
-def mass_balance(point: WaterPoint) -> WaterUse:
+def mass_balance(point: WaterPoint) -> WaterQuantities:
     """Evaporation, drift and blowdown (EnergyPlus Engineering Reference, tower make-up water).
 
     All heat is taken to leave as vapour, an upper bound (in frost a part leaves as warm air), and
@@ -86,7 +71,7 @@ def mass_balance(point: WaterPoint) -> WaterUse:
     )
 
 
-def saturated_exit(point: WaterPoint) -> WaterUse:
+def saturated_exit(point: WaterPoint) -> WaterQuantities:
     """Evaporation into air that leaves the tower saturated, drift and blowdown.
 
     The heat raises the enthalpy of the tower's air from that of saturated air at the wet bulb, and
@@ -111,7 +96,7 @@ def saturated_exit(point: WaterPoint) -> WaterUse:
     return _with_blowdown(taken_up_kg_s * point.dt_s, drift_l, point.cycles_of_concentration)
 
 
-def released(point: WaterPoint) -> WaterUse:
+def released(point: WaterPoint) -> WaterQuantities:
     """The fit of the released SustainDC code, from the air temperatures of the room.
 
     max(0, 0.044*T_wb + 0.3528*(T_ret - T_set) + 0.101) m3/h, 1 % drift on top, litres rounded to
@@ -125,7 +110,7 @@ def released(point: WaterPoint) -> WaterUse:
     return _water(water_l - drift_l, drift_l, 0.0, water_l)
 
 
-def paper(point: WaterPoint) -> WaterUse:
+def paper(point: WaterPoint) -> WaterQuantities:
     """Appendix A.2.6 as printed: w = 0.044*T_wb + 0.35*range + 0.1 m3/h, max(0, w) + 0.01*w.
 
     The drift term is printed on the unclipped w, so the use is slightly negative where w is.
@@ -136,7 +121,7 @@ def paper(point: WaterPoint) -> WaterUse:
     return _water(evaporation_l, drift_l, 0.0, evaporation_l + drift_l)
 
 
-WATER: dict[str, Callable[[WaterPoint], WaterUse]] = {
+WATER: dict[str, Callable[[WaterPoint], WaterQuantities]] = {
     "saturated_exit": saturated_exit,
     "mass_balance": mass_balance,
     "released": released,
@@ -147,7 +132,7 @@ WATER: dict[str, Callable[[WaterPoint], WaterUse]] = {
 
 def _with_blowdown(
     evaporation_l: Values, drift_l: Values, cycles_of_concentration: Values
-) -> WaterUse:
+) -> WaterQuantities:
     """Water of a step whose blowdown holds the concentration of solids."""
     blowdown_l = np.maximum(evaporation_l / (cycles_of_concentration - 1.0) - drift_l, 0.0)
     return _water(evaporation_l, drift_l, blowdown_l, evaporation_l + drift_l + blowdown_l)
@@ -158,6 +143,8 @@ def _litres_per_m3h(dt_s: Values) -> Values:
     return 1000.0 * dt_s / 3600.0
 
 
-def _water(evaporation_l: Values, drift_l: Values, blowdown_l: Values, water_l: Values) -> WaterUse:
+def _water(
+    evaporation_l: Values, drift_l: Values, blowdown_l: Values, water_l: Values
+) -> WaterQuantities:
     """Result of a step, all fields of one shape."""
-    return WaterUse(*np.broadcast_arrays(evaporation_l, drift_l, blowdown_l, water_l))
+    return WaterQuantities(*np.broadcast_arrays(evaporation_l, drift_l, blowdown_l, water_l))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from sdc_taichi.plant.chiller import ChillerParameters
-from sdc_taichi.types import F64, Values, as_array
+from sdc_taichi.types import F64, PlantQuantities, Values, as_array
 
 LEAST_COIL_LOAD = 0.1
 """Least load of the coils over that at design below which the range of their water stays."""
@@ -83,26 +83,10 @@ class WaterSideDesign:
     """Largest relative humidity of outdoor air at the supply setpoint, 0..1, (B,)."""
 
 
-@dataclass(frozen=True, slots=True)
-class WaterSideResult:
-    """One step of the plants of B data centers."""
+@dataclass
+class WaterSideResult(PlantQuantities):
+    """One step of the plants of B data centers, with flows that make-up water is computed from."""
 
-    heat_removed_w: F64
-    """Heat taken from the room, in W, (B,): that of economiser and chiller less that of the
-    chilled-water pumps."""
-    economiser_w: F64
-    """Heat that economiser, dry cooler or outdoor air takes past the chiller, in W, (B,)."""
-    chiller_load_w: F64
-    """Heat that the chiller takes off the chilled water, in W, (B,)."""
-    chiller_w: F64
-    """Electric power of the chiller, in W, (B,)."""
-    rejected_w: F64
-    """Heat that goes to the outside, in W, (B,)."""
-    chilled_water_c: F64
-    """Temperature of the chilled water supply, in C, (B,)."""
-    condenser_water_c: F64
-    """Temperature of the water that leaves the tower, or of the outdoor air that cools an
-    air-cooled condenser, in C, (B,)."""
     tower_range_k: F64
     """Entering less leaving water temperature of the tower, in K, (B,)."""
     tower_water_kg_s: F64
@@ -111,12 +95,6 @@ class WaterSideResult:
     """Airflow of the tower, in m3/s, (B,)."""
     humidifier_kg_s: F64
     """Water that evaporates into outdoor air on its way into the hall, in kg/s, (B,)."""
-    tower_fan_w: F64
-    """Power of the fans of tower, dry cooler or outdoor air, in W, (B,)."""
-    chilled_pump_w: F64
-    """Power of the chilled-water pumps, in W, (B,)."""
-    condenser_pump_w: F64
-    """Power of the pumps of condenser water, or of the dry cooler's loop, in W, (B,)."""
 
     def scaled(self, share: F64) -> WaterSideResult:
         """Means over a step during a share of which, (B,), the plant ran.

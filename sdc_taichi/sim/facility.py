@@ -24,7 +24,7 @@ from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
+from sdc_taichi.plant.water import WATER, WaterPoint
 from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
@@ -39,6 +39,7 @@ from sdc_taichi.types import (
     CracQuantities,
     RoomQuantities,
     State,
+    WaterQuantities,
     as_array,
     fields_of,
     joined,
@@ -287,13 +288,13 @@ class Facility:
 
     def _use_water(
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
-    ) -> WaterUse:
+    ) -> WaterQuantities:
         """Water that the tower evaporates, loses and gets; else that of the humidifier."""
         if self._plant.dry:
             nothing = 0.0 * plant.rejected_w
             evaporation_l = plant.humidifier_kg_s * (self._step_h * 3600.0)
             blowdown_l = evaporation_l / (self._water["cycles_of_concentration"] - 1.0)
-            return WaterUse(evaporation_l, nothing, blowdown_l, evaporation_l + blowdown_l)
+            return WaterQuantities(evaporation_l, nothing, blowdown_l, evaporation_l + blowdown_l)
         return self._water_model(
             WaterPoint(
                 rejected_w=plant.rejected_w,
