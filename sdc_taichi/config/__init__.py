@@ -1,7 +1,7 @@
-"""The configuration of a data center: its schema, and how files and overrides become one.
+"""The configuration of a data center: its schema, and readers of presets, files and overrides.
 
-Valid fields, their bounds and the errors about them are defined here. Nothing here computes a hall
-or a plant, and no other module validates a configuration.
+This package defines the valid fields, their bounds and the errors about them. It computes no hall
+and no plant, and no other module validates a configuration.
 """
 
 from sdc_taichi.config.event_schema import (

@@ -86,7 +86,7 @@ class TariffPeriod(Section):
     """Local hour at which the period ends, 1..24; one that is not after ``from_h`` is that of the
     next day, whose early hours count by their own day and month."""
     price_per_kwh: Price
-    """Price of a kWh in the period, in place of what the tariff and earlier periods say."""
+    """Price of a kWh in the period, which replaces that of the tariff and of earlier periods."""
 
     @field_validator("months")
     @classmethod
@@ -122,7 +122,8 @@ class TariffConfig(Section):
     """Price of a kWh: one for all hours, or a list of 24, one for each local hour of the day from
     midnight on."""
     periods: tuple[TariffPeriod, ...] = ()
-    """Prices of some months, days of the week and hours, of which later ones go first."""
+    """Prices for some months, days of the week and hours; where periods overlap, the later entry
+    applies."""
     demand_charge_per_kw: Price = 12.0
     """Price of each kW of the highest mean power of a step, per month."""
 

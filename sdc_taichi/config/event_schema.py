@@ -1,4 +1,4 @@
-"""Sections ``events`` and ``protection``: what goes wrong in a run, and how servers meet it."""
+"""Sections ``events`` and ``protection``: failures in a run, and how servers protect themselves."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
 """Duration of an event, 0.001..876,000 h: from a few seconds to a century."""
 
 OutletC = Annotated[float, Field(ge=20, le=120)]
-"""Temperature of the air that servers give off, 20..120 C: from inlets to what no board bears."""
+"""Temperature of the air that leaves servers, 20..120 C: from inlets to what damages any board."""
 
 LEAST_DRAUGHT_SHARE = 0.01
 """Least share of its airflow that a rack keeps without fans, as warm air rises through it."""
@@ -95,7 +95,7 @@ class ProtectionConfig(Section):
 
 
 class ScheduledEvent(Section):
-    """Something that goes wrong at a known time."""
+    """A failure or weather event at a known time."""
 
     kind: EventKind
     """Kind of event."""
@@ -121,7 +121,7 @@ class ScheduledEvent(Section):
 
 
 class SampledEvent(Section):
-    """Something that goes wrong at random times: a Poisson process with uniform durations.
+    """Failures or weather events at random times: a Poisson process with uniform durations.
 
     CRAC units and racks are drawn evenly.
     """
@@ -148,7 +148,7 @@ class SampledEvent(Section):
 
 
 class EventsConfig(Section):
-    """Failures and weather that a run meets."""
+    """Failures and weather events of a run."""
 
     scheduled: tuple[ScheduledEvent, ...] = ()
     """Events at known times."""

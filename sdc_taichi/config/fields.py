@@ -1,8 +1,9 @@
 """Types of the fields of a configuration, the base of its sections, and messages about bad values.
 
-A field of a number has bounds at both ends, which a test holds. They are what no machine, hall or
-weather can exceed, not what is usual, so that a value in another unit is refused and every real one
-is taken. A type below says why; a field with bounds of its own says so in its docstring.
+Every numeric field has a lower and an upper bound, which a test checks. Bounds are physical limits
+and not usual values: they admit every real machine, hall and weather, and reject most values in a
+wrong unit. The types below explain their bounds; a field with bounds of its own explains them in
+its docstring.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from sdc_taichi.plant.plants import PLANTS
 Share = Annotated[float, Field(ge=0, le=1)]
 """A share, 0..1."""
 WorkingShare = Annotated[float, Field(ge=0.01, le=1)]
-"""A share of what a machine does at its design point, 0.01..1: at less than a hundredth of its flow
-or with less than a hundredth of its efficiency, it is out of order."""
+"""A share of a machine's design flow or efficiency, 0.01..1: below a hundredth it is out of
+order."""
 AirC = Annotated[float, Field(ge=0, le=60)]
 """Temperature of air that servers take in or units supply, 0..60 C: coils freeze below, and no
 ASHRAE class of servers (A4: 45 C) comes near the upper end."""
@@ -39,8 +40,8 @@ C (Furnace Creek 1913)."""
 DewPointC = Annotated[float, Field(ge=-40, le=35)]
 """Dew point of outdoor air, -40..35 C: from polar air to the highest on record (Dhahran, 2003)."""
 DifferenceK = Annotated[float, Field(ge=-50, le=50)]
-"""Difference of two temperatures of a hall or plant, -50..50 K: as much as lies between its coldest
-water and its hottest air."""
+"""Difference of two temperatures of a hall or plant, -50..50 K, from the coldest water to the
+hottest air."""
 RiseK = Annotated[float, Field(ge=0, le=50)]
 """Difference of two temperatures of a hall or plant of which the second is not below the first,
 0..50 K."""
@@ -48,8 +49,8 @@ ExchangerK = Annotated[float, Field(ge=0.1, le=50)]
 """Difference of temperatures that drives a heat exchanger, 0.1..50 K: towards 0 K its area has no
 limit."""
 WaterRangeK = Annotated[float, Field(ge=0.5, le=50)]
-"""Difference of temperatures between water that flows to and fro, 0.5..50 K: its flow is the heat
-over the range, and at less than 0.5 K ten times that of any plant."""
+"""Temperature difference of supply and return water, 0.5..50 K: the flow is the heat divided by
+this range, and below 0.5 K it would be ten times that of any plant."""
 LengthM = Annotated[float, Field(ge=0.01, le=1000)]
 """Length within a hall, 0.01..1,000 m; the largest buildings measure about a kilometre."""
 Hours = Annotated[float, Field(ge=0.001, le=8760)]
@@ -65,12 +66,12 @@ FlowM3sPerW = Annotated[float, Field(ge=1e-5, le=0.01)]
 """Airflow per power, 1e-5..0.01 m3/s per W: the power warms the air by 81 K at the lower end, more
 than any server bears, and by less than 0.1 K at the upper."""
 PowerRatio = Annotated[float, Field(ge=0, le=2)]
-"""Power over that at full load, 0..2; turbo clocks and leakage add less than its double."""
+"""Power divided by that at full load, 0..2: turbo clocks and leakage do not double it."""
 FlowRatio = Annotated[float, Field(ge=-1, le=10)]
 """Airflow of a server over its full airflow on a straight line, -1..10; below 0 the fans stand."""
 CRate = Annotated[float, Field(ge=0.001, le=1000)]
-"""Power of a battery over its capacity, 0.001..1,000 1/h: from iron-air batteries that last for
-days to flywheels and capacitors that last for seconds."""
+"""Power of a battery divided by its capacity, 0.001..1,000 1/h: from iron-air batteries that last
+for days to flywheels and capacitors that last for seconds."""
 Count = Annotated[int, Field(ge=1, le=10_000)]
 """A number of parts, 1..10,000: more servers or zones than any rack has."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
@@ -167,7 +168,7 @@ def check_one_per_rack(name: str, values: Any, racks: int, *, one_for_all: bool 
 Model = TypeVar("Model", bound=BaseModel)
 
 MOST_PROBLEMS = 3
-"""Number of problems that a message lists; of further ones it gives the number."""
+"""Largest number of problems that a message lists; it only counts further ones."""
 
 
 def validated(model: type[Model], values: Any, label: str) -> Model:
@@ -175,7 +176,7 @@ def validated(model: type[Model], values: Any, label: str) -> Model:
 
     Args:
         model: the schema.
-        values: what is to be validated against it.
+        values: plain values to validate.
         label: where the values come from, at the start of every message.
 
     Raises:
@@ -191,9 +192,9 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
     """One line on what is wrong, with key, value and what is valid.
 
     Args:
-        error: what pydantic found.
+        error: errors of pydantic.
         label: where the values come from, at the start of the line.
-        model: the schema that was validated against.
+        model: the schema.
     """
     problems: dict[str, str] = {}
     # An unknown key may be the misspelling of one that is missing.
@@ -216,7 +217,7 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
             value = item["input"]
             if value is None or isinstance(value, str | int | float | bool):
                 text += f" (got {shortened(value)})"
-        # Each branch of a union has a problem of its own; the first says enough.
+        # Each branch of a union reports a problem; the first suffices.
         problems.setdefault(where, text)
     left_out = len(problems) - MOST_PROBLEMS
     more = f" (and {left_out} more)" if left_out > 0 else ""
@@ -224,7 +225,7 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
 
 
 def _is_union_branch(part: str | int) -> bool:
-    """Whether a part of pydantic's location is the tried type of a union and no key of the user."""
+    """Whether a part of pydantic's location is a branch of a union, and not a key of the user."""
     return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
 
 

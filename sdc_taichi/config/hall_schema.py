@@ -33,17 +33,18 @@ from sdc_taichi.plant.servers import ServerCurves, linear_curve
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
 SERVER_J_PER_K_W = 30.0
-"""Heat capacity of servers over their power at full load, in J/(K W): 12 kJ/K were measured of a
-server of two units (Ibrahim, Shrivastava, Sammakia, Ghose 2012, "Thermal mass characterization of a
-server at different fan speeds", ITherm), which draws some 400 W."""
+"""Heat capacity of servers divided by their power at full load, in J/(K W): a server of two units,
+which draws some 400 W, was measured to have 12 kJ/K (Ibrahim, Shrivastava, Sammakia, Ghose 2012,
+"Thermal mass characterization of a server at different fan speeds", ITherm)."""
 ROOM_J_PER_K_W = 15.0
-"""Heat capacity of what follows the supply air over the servers' power at full load, in J/(K W):
-coils with their water, and raised floor."""
+"""Heat capacity of coils, their water and the raised floor, which follow the supply air, divided by
+the servers' power at full load, in J/(K W)."""
 MOST_RACK_U = 58.0
 """Height of the tallest racks, in units of 44.45 mm."""
 LEAST_INLET_RANGE_K = 5.0
-"""Least difference of the two inlets between which curves of servers are given, in K: fans run over
-some 10 K, and over 1 K they would do a hundred times their power a few degrees beyond it."""
+"""Smallest difference of the two inlets between which server curves are given, in K. Fans speed up
+over about 10 K; with a difference of 1 K, the extrapolated fan power a few kelvins above it would
+be a hundredfold."""
 RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
 """A number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
@@ -53,7 +54,8 @@ FullAirflow = Annotated[float, Field(ge=1e-4, le=100)]
 DesignRiseK = Annotated[float, Field(ge=2, le=40)]
 """Temperature rise of the air through a server at the design point, in K, 2..40."""
 RackLength = Annotated[float, Field(ge=0.1, le=5)]
-"""A measure of a rack, in m, 0.1..5; racks are 0.6 m wide, 1.2 m deep and 2.1 m high or near."""
+"""A measure of a rack, in m, 0.1..5; usual racks are about 0.6 m wide, 1.2 m deep and 2.1 m
+high."""
 
 
 class LayoutConfig(Section):
@@ -81,7 +83,7 @@ class LayoutConfig(Section):
     containment: Share = 0.0
     """Share of the paths from hot to cold aisles that containment closes, 0..1."""
     returns: Literal["ceiling", "end_wall"] = "ceiling"
-    """Where warm air leaves the hall: grilles above the hot aisles, or the wall at the row ends."""
+    """Outlet of warm air: grilles above the hot aisles, or the walls at the row ends."""
 
     @model_validator(mode="after")
     def _racks_fit(self) -> Self:
@@ -104,11 +106,12 @@ class RecirculationConfig(Section):
     """File (.npz, .csv) with the matrix R or D of a CFD study, in place of the weights that follow
     from the layout; None is the layout."""
     matrix_kind: Literal["R", "D"] | None = None
-    """Which matrix a .csv file holds; None where the .npz file names it."""
+    """Kind of the matrix in a .csv file; None for .npz files, which name it."""
     calibrate: Literal["rack", "row", "hall", "none"] | None = None
-    """Approach temperatures that recirculation is scaled to: those of each rack, their mean over a
-    row or over the hall, within which layout or matrix file tell racks apart, or none, those that
-    follow from the matrix file. None is ``none`` with a matrix file and ``row`` without."""
+    """Approach temperatures that recirculation is scaled to: those of each rack; their means over
+    each row or over the hall, within which racks differ by the layout or the matrix file; or
+    ``none``, which keeps those that follow from the matrix file. None is ``none`` with a matrix
+    file and ``row`` without one."""
 
     @property
     def scaled_to(self) -> Literal["rack", "row", "hall", "none"]:
@@ -130,7 +133,7 @@ class RecirculationConfig(Section):
 
 
 class ServerGroup(Section):
-    """Servers of a rack that are alike: computed once, expanded to servers on request."""
+    """Equal servers of a rack, which are computed once."""
 
     count: Count
     """Number of servers."""
@@ -148,7 +151,7 @@ class ServerGroup(Section):
     to ten racks in one; None is that of ``servers.fan_full_airflow_m3s``."""
     design_rise_k: DesignRiseK | None = None
     """Temperature rise of the air through the server at the design point, in K, 2..40, in place of
-    ``full_airflow_m3s``: less takes a storm, and more no server bears."""
+    ``full_airflow_m3s``: less needs extreme airflow, and more damages the server."""
     fan_w: IdleW | None = None
     """Fan power of one server at ``servers.fan_reference_ratio``, in W; None is by ``servers``."""
     height_u: Annotated[float, Field(ge=0.1, le=58)] | None = None
@@ -168,7 +171,7 @@ class ServerGroup(Section):
 
 
 class RackType(Section):
-    """A rack with all that stands in it."""
+    """A type of rack, by the servers in it."""
 
     servers: Annotated[tuple[ServerGroup, ...], Field(min_length=1)]
     """Servers of the rack from the floor up: one group, or several."""
@@ -180,7 +183,7 @@ class RackType(Section):
 
 
 class RackRange(Section):
-    """Places of the hall whose racks are of one type."""
+    """A range of places of the hall whose racks are of one type."""
 
     type: Name
     """Name of the type, one of ``rack_types``."""
@@ -242,7 +245,7 @@ class HallConfig(Section):
     rack_types: dict[Name, RackType] = Field(default={})
     """Types of racks by their names, in place of ``servers.power_w`` and ``servers.groups``."""
     rack_plan: tuple[RackRange, ...] = ()
-    """Which type stands where; none is needed for a single type."""
+    """Places of each type of rack; with a single type no plan is needed."""
     capacity_mw: Annotated[float, Field(ge=1e-6, le=1e5)] | None = None
     """IT nameplate power that the number of servers is scaled to, in MW, from a server of 1 W to
     1e5, more than all data centers of the world draw; None keeps ``servers_per_rack``."""

@@ -33,7 +33,7 @@ from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 USUAL_AIR_J_PER_M3_K = 1.2e3
-"""Heat capacity of air by volume near sea level, in J/(m3 K), for checks alone."""
+"""Heat capacity of air by volume near sea level, in J/(m3 K), used by checks only."""
 MOST_CRAC_UNITS = 10_000
 """Largest number of CRAC units of a hall, one for each fan of the largest fan walls."""
 UnitAirflow = Annotated[float, Field(ge=0.01, le=1000)]
@@ -46,7 +46,7 @@ UnitCapacity = Annotated[float, Field(ge=0.1, le=1e5)]
 class SetpointConfig(Section):
     """Setpoint of the CRAC units: range, first value and how actions move it.
 
-    It is of the supply air, or of the return air where ``crac.temperature_control`` says so.
+    It applies to the supply air, or to the return air with ``crac.temperature_control: return``.
     """
 
     model: Annotated[str, NameIn(SETPOINTS)] = "symmetric"
@@ -107,7 +107,7 @@ class SetpointConfig(Section):
 
 
 class CracConfig(Section):
-    """CRAC units: number, size, control of their fans, who supplies whom."""
+    """CRAC units: number, size, fan control, and the racks that each supplies."""
 
     units: Annotated[int, Field(ge=1, le=MOST_CRAC_UNITS)] = 1
     """Number of CRAC units, along both end walls in turn and evenly spread over the rows,
@@ -127,29 +127,31 @@ class CracConfig(Section):
     """Most heat that the coil of a unit takes out, that of its fan included, in kW: one for all
     units, or one per unit; None is no limit but that of the plant."""
     temperature_control: Literal["supply", "return"] = "supply"
-    """Air that the setpoint is of: what a unit supplies, or what returns to it. With ``return`` the
-    supply air is colder the more heat there is to remove, down to the setpoint less the rise of the
-    air at the design point."""
+    """Air whose temperature the setpoint controls: that supplied by a unit, or that returning to
+    it. With ``return`` the supply air becomes colder as the heat to remove grows, down to the
+    setpoint less the temperature rise of the air at the design point."""
     supply_m3s_per_w: FlowM3sPerW = 5.663e-5
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
     flow_model: Annotated[str, NameIn(CRAC_FLOWS)] = "follow_servers"
-    """Control of the units' fans: at the speed of the design point; by the pressure under a raised
-    floor, which takes the same airflow whatever units run; by the supply air that the servers take
-    in; by the hottest inlet of the servers; by IT power; or by the actions of an agent."""
+    """Control of the units' fans: constant at the speed of the design point; by the pressure under
+    a raised floor, which takes the same airflow whichever units run; by the supply air that the
+    servers take in; by the hottest inlet of the servers; by IT power; or by the actions of an
+    agent."""
     inlet_target_c: Annotated[float, Field(ge=1, le=60)] = 25.0
     """Hottest inlet at which fans of flow model ``hottest_inlet`` reach full speed, in C, 1..60."""
     inlet_band_k: ExchangerK = 4.0
-    """How far the hottest inlet is below that where they reach their lowest speed, in K."""
+    """Difference between ``inlet_target_c`` and the hottest inlet at which these fans reach their
+    lowest speed, in K."""
     min_flow_ratio: WorkingShare = 0.3
     """Lowest airflow of a running unit over its airflow at full speed, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
     """Change of fan speed over full speed by one action, for flow model ``controlled``, 0.001..1:
     from less than any drive resolves to the whole range."""
     coasting_flow_ratio: WorkingShare = 0.1
-    """Airflow through a unit that is down over its airflow at full speed, 0.01..1: as much leaks
-    through closed dampers."""
+    """Airflow that leaks through the closed dampers of a unit that is down, divided by its airflow
+    at full speed, 0.01..1."""
     fan_w_per_m3s: Annotated[float, Field(ge=0, le=20_000)] = 1000.0
     """Design fan power per design airflow (specific fan power), in W per m3/s, 0..20,000: four
     times the worst class of EN 16798-3."""
@@ -191,7 +193,7 @@ class ChillerConfig(Section):
     """Supply air setpoint above the chilled water that the coils take, in K; more where the chiller
     makes no water as warm as that."""
     chilled_water_range_k: WaterRangeK = 6.0
-    """Chilled water that returns above chilled water that is supplied, at design, in K."""
+    """Return less supply temperature of the chilled water, at design, in K."""
     coil_valves: bool = True
     """Whether control valves match the water flow of the coils to their load: the water then
     returns warmer at part load. Without valves it returns ``chilled_water_range_k`` above the
@@ -211,9 +213,10 @@ class TowerConfig(Section):
     model: Annotated[str, NameIn(TOWERS)] = "yorkcalc"
     """How fan power and water temperature of the tower follow from the heat to reject."""
     approach_min_k: ExchangerK = 4.0
-    """Least approach: coldest water that the tower gives, above wet bulb, in K."""
+    """Smallest approach: coldest water from the tower less the wet bulb, in K."""
     water_range_k: WaterRangeK = 5.56
-    """Water that enters the tower above water that leaves it, at the design point, in K."""
+    """Temperature of the water that enters the tower less that of the water that leaves it, at the
+    design point, in K."""
     fan_w_per_w_rejected: Annotated[float, Field(ge=0, le=1)] = 0.02
     """Design fan power per heat rejected at the design point, in W per W, 0..1: at 1 the fan alone
     would warm the air as much as the heat does."""
@@ -230,8 +233,8 @@ class TowerConfig(Section):
     economiser: bool = True
     """Whether a waterside economiser cools the return water before the chiller."""
     economiser_approach_k: RiseK = 5.0
-    """Approach of tower and heat exchanger together: coldest water that the exchanger gives, above
-    wet bulb, in K."""
+    """Approach of tower and heat exchanger together: coldest water from the exchanger less the wet
+    bulb, in K."""
 
     @model_validator(mode="after")
     def _exchanger_adds(self) -> Self:

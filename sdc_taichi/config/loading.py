@@ -20,7 +20,7 @@ from sdc_taichi.number_text import parse_whole
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 DEFAULT_PRESET = "corrected"
-"""Preset that is read where none is named."""
+"""Preset that is loaded by default."""
 _REPLACES: dict[str, dict[str, Any]] = {
     "servers.power_w": {"servers.groups": None, "hall.rack_types": {}, "hall.rack_plan": []},
     "servers.groups": {"servers.power_w": None, "hall.rack_types": {}, "hall.rack_plan": []},
@@ -47,7 +47,7 @@ def load_config(
             ``DataCenterConfig``, which may name a preset to start from under ``extends``, or a path
             to the SustainDC JSON format, which starts from preset ``sustaindc``. None is
             ``corrected``.
-        overrides: ``a.b=c`` assignments applied last; ``c`` is read as YAML.
+        overrides: ``a.b=c`` assignments, applied last; ``c`` is read as YAML.
 
     Raises:
         ConfigError: naming the file, the key, the value and what would be valid.
@@ -64,7 +64,7 @@ def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCente
     """A config of plain values, section by section.
 
     Args:
-        values: what a YAML file with the schema of ``DataCenterConfig`` would say.
+        values: content of a YAML file with the schema of ``DataCenterConfig``.
         label: where the values come from, at the start of every message.
 
     Raises:
@@ -215,7 +215,7 @@ def _parse(text: str, label: str, kind: str = "YAML") -> dict[str, Any]:
 
 
 def apply_override(values: dict[str, Any], override: str) -> None:
-    """Put an assignment into plain values, not yet checked.
+    """Apply an assignment to plain values, without validating them.
 
     Args:
         values: sections, which are changed.

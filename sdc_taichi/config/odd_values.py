@@ -1,4 +1,4 @@
-"""Warnings of values that are valid in a configuration, but probably a mistake."""
+"""Warnings about values of a configuration that are valid, but probably a mistake."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
-    """Warn of odd values of data centers; a value that several of them share is named once.
+    """Warn about odd values of data centers, once for each value that several of them share.
 
     Warns:
         OddInputWarning: for each odd value.
@@ -79,7 +79,7 @@ def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
 
 
 def warn_of(messages: Iterable[tuple[str, Sequence[str]]]) -> None:
-    """Warn of odd data centers; a message that several of them share is given once.
+    """Warn about odd data centers, once for each message that several of them share.
 
     Args:
         messages: name of each data center, and the messages about it.

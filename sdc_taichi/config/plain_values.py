@@ -1,8 +1,8 @@
 """Plain values of YAML and JSON texts: mappings, lists, texts, numbers, booleans and nothing.
 
-Both formats allow more than a configuration has a use for. Here a key is given once, and a number
-is decimal: YAML 1.1 also reads ``1:30`` as 90 and ``017`` as 15. Its merge key ``<<``, by which a
-few lines make millions of keys, is a key like any other.
+Both formats allow more than a configuration needs. Here a key may be given only once, and numbers
+are decimal: YAML 1.1 also reads ``1:30`` as 90 and ``017`` as 15. The merge key ``<<`` of YAML is
+read as an ordinary key.
 """
 
 from __future__ import annotations

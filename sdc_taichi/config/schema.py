@@ -94,7 +94,7 @@ class WorkloadConfig(Section):
     trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
-    """Policy by which the work of a step is spread over the racks."""
+    """Policy that distributes the work of a step over the racks."""
     flexible_share: Share = 0.2
     """Share of the work that may wait, 0..1."""
     max_utilisation: WorkingShare = 1.0
@@ -133,8 +133,8 @@ class SiteConfig(Section):
     workload_file: FileName | None = None
     """CSV file in place of the workload trace; None is no file."""
     carbon_pairing: Literal["local", "utc_rows"] = "local"
-    """How carbon intensity meets weather in time: both in local standard time, or UTC rows with
-    local rows as the released SustainDC does."""
+    """Alignment in time of carbon intensity and weather: both in local standard time, or rows in
+    UTC beside local rows as in the released SustainDC."""
 
     @field_validator("start", mode="before")
     @classmethod
@@ -359,13 +359,13 @@ class DataCenterConfig(Section):
         return np.asarray(rack_w * (self.hall.capacity_mw * 1e6 / rack_w.sum()))
 
     def _given_groups(self) -> dict[str, tuple[ServerGroup, ...]]:
-        """Server groups of types of racks and of racks, by where they are given."""
+        """Server groups of rack types and of single racks, by the path of their field."""
         types = {f"hall.rack_types.{k}": v.servers for k, v in self.hall.rack_types.items()}
         racks = {f"servers.groups rack {i}": r for i, r in enumerate(self.servers.groups or ())}
         return types | racks
 
     def _listed_groups(self) -> tuple[tuple[ServerGroup, ...], ...] | None:
-        """Server groups of every rack, or of all at once, where they are given."""
+        """Server groups of every rack, or one entry for all racks; None without any."""
         types = self.hall.rack_types
         return tuple(types[n].servers for n in self.hall.rack_type_names()) or self.servers.groups
 
@@ -415,12 +415,12 @@ class DataCenterConfig(Section):
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
         if all(map(str.isprintable, text.split("\n"))):
             return text
-        # Escapes what a terminal would obey, and reads back equal.
+        # Escaped control characters do nothing in a terminal, and read back equal.
         return yaml.safe_dump(values, sort_keys=False)
 
 
 def _check_rack(where: str, rack: tuple[ServerGroup, ...]) -> None:
-    """Check that the servers of a rack fit into it, and that none has more work than it can do."""
+    """Check that the servers of a rack fit into it, and that none is overloaded."""
     if not rack:
         raise ValueError(f"{where} is empty; valid is at least one group")
     height_u = sum(g.count * g.height_u for g in rack if g.height_u is not None)

@@ -1,4 +1,4 @@
-"""One hall: where racks stand, whose exhaust they breathe, and the indices of its air.
+"""One hall: its floor plan, recirculation of exhaust air, placement of work, and air indices.
 
 Everything here works on one configuration or on plain arrays, without a simulator.
 Nothing here steps through time, sizes a plant or runs a Taichi kernel.

@@ -17,16 +17,17 @@ ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": 
 """Lowest and highest allowable inlet, in C, by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 
 TIE_K = 0.05
-"""Difference up to which racks count as equally hot, in K: numbers on pictures do not show it."""
+"""Difference up to which racks count as equally hot, in K; figures with one decimal do not show
+it."""
 _USUAL_CLASS = "A2"
 LEAST_EXCESS_K = 1e-5
-"""Least excess over a limit, in K: in f32 an inlet that is to be at the limit may lie above it by
-two last digits, 4e-6 K."""
+"""Smallest excess over a limit that counts, in K: in f32 an inlet at the limit may lie above it by
+two units of the last digit, 4e-6 K."""
 _ROUND_OFF_K = 1e-4
-"""Mean rises up to this, in K, of either sign are none: f32 temperatures hold no smaller ones, and
-their last bits depend on the order of sums."""
+"""Mean rises up to this, in K and of either sign, count as 0: f32 temperatures do not resolve
+smaller ones, and their last bits depend on the order of sums."""
 _NO_AIRFLOW_M3S = 1e-9
-"""Airflow up to this, in m3/s, is none."""
+"""Airflow up to this, in m3/s, counts as none."""
 
 
 def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
@@ -73,7 +74,7 @@ def over_27_sum_k(inlet_c: F64) -> F64:
 
 
 def under_18_sum_k(inlet_c: F64) -> F64:
-    """Sum over the racks of what their inlets lie below 18 C by, in K, (...).
+    """Sum over the racks of the difference of 18 C and colder inlet temperatures, in K, (...).
 
     Args:
         inlet_c: Inlet temperature of each rack, C, (..., N).
@@ -167,7 +168,7 @@ def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     Cooling Index (RCI)", ASHRAE Transactions 111(2). 100 is no inlet below the recommended range.
 
     Args:
-        under_k: Sum over the inlets of what they lie below 18 C by, K.
+        under_k: Sum over the inlets colder than 18 C of their difference from it, K.
         racks: Number of inlets in the sum, at least 1.
         allowable_c: Lower end of the allowable range, C, below 18.
     """

@@ -16,15 +16,17 @@ _MOST_HEIGHT_ITERATIONS = 100
 
 
 MOST_RISE_K = 40.0
-"""Most that the air warms by in a server, in K: from an inlet of 27 C to 67 C, the most that parts
-behind processors bear."""
+"""Largest temperature rise of the air in a server, in K: from an inlet of 27 C to 67 C, the limit
+of parts behind processors."""
 MOST_USUAL_RISE_K = 25.0
-"""Servers in air warm it by 10 to 20 K at full load, the densest by 25 K."""
+"""Largest usual temperature rise of the air in a server at full load, in K: most have 10 to 20 K,
+the densest 25 K."""
 MOST_USUAL_RTI_PCT = 200.0
-"""Open halls without order in their aisles reach a return temperature index of about 150 %."""
+"""Largest usual return temperature index, in %: open halls without cold and hot aisles have about
+150 %."""
 LEAST_USUAL_UNIT_SHARE = 0.9
-"""CRAC units smaller than the design airflow make up for it with exhaust air at full load; a tenth
-is bearable in halls that never reach full load."""
+"""Usual airflow of CRAC units, divided by the design airflow. With smaller units racks take in more
+exhaust air at full load; a tenth less is acceptable in halls that never reach full load."""
 _MOST_LISTED = 3
 
 
@@ -80,7 +82,7 @@ def design_point(
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``, if at hand.
+        servers: Its ``rack_servers``; None computes them.
         approach_k: Inlet over supply air, K, (R,); None is as given in the config.
 
     Raises:
@@ -189,9 +191,9 @@ def _full_airflow_m3s(
 ) -> F64:
     """Airflow of a server of each group at an airflow ratio of 1, in m3/s, (G,).
 
-    As configured, or by the design rise of the group. Servers for which neither is given move air
-    in proportion to their power, by as much as leaves the mean rise of their racks that the
-    approach temperatures close on.
+    It is as configured, or follows from the design rise of the group. Servers with neither move air
+    in proportion to their power, so that the mean rise of their racks closes the heat balance of
+    the hall with its approach temperatures.
     """
     full_m3s = servers.full_airflow_m3s
     if not np.isnan(full_m3s).any():

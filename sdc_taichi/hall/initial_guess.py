@@ -42,33 +42,33 @@ from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F32, F64, I32
 
 TABLE_LOADS = np.linspace(0.0, 1.0, 161)
-"""Loads of the table, so close because airflow and power bend where their limits set in, for each
-rack and height at another load."""
+"""Loads of the table. They are close because airflow and power have kinks where their limits set
+in, at a different load for each rack and height."""
 SUPPLY_STEP_K = 0.5
 """Distance of the supply temperatures of the table, in K; setpoints move in whole or half kelvins.
 A wide range of setpoints has wider steps."""
 MOST_SUPPLIES = 65
 """Most supply temperatures of the table of a wide range of setpoints."""
 PATTERNS = 7
-"""Most patterns of a hall; they tell all mixes of a hall of 20 racks to 2e-4 K."""
+"""Largest number of patterns of a hall; they reproduce all mixes of a hall of 20 racks to 2e-4
+K."""
 SAMPLED_RACKS = 4
-"""Racks whose mean stands for all racks of a hall that drops weights."""
+"""Number of racks whose mean represents all racks of a hall that drops weights."""
 
 _BATCH_VALUES, _LEAST_BATCH = 2**13, 32
-"""Values that are computed at a time, so that they stay in the cache, and least table entries that
-are computed at a time."""
+"""Number of values per batch, so that a batch fits into the processor's cache, and smallest number
+of table entries per batch."""
 _SECANT_K = 1e-3
 """Smallest move of a mix, in K, from which a feedback gain is read."""
 _LAST_STEP_K = 2e-3
-"""Largest Newton step that ends the search, in K; another would be shorter by a factor of fifty to
-a hundred."""
+"""Largest Newton step that ends the search, in K; the next one would be 50 to 100 times shorter."""
 _USUAL_GAIN = 0.2
-"""Feedback gain of a usual hall, from which the search starts."""
+"""Feedback gain of a usual hall, with which the search starts."""
 _MOST_GAIN = 0.9
-"""Largest feedback gain, of either sign, that the search goes by."""
+"""Largest absolute feedback gain that the search uses."""
 _MOST_HEAT_K = 100.0
-"""Most that heat warms air by, in K. Where fans hardly blow it knows no bounds, and would drown all
-other entries in the patterns."""
+"""Upper limit of the temperature rise of the air, in K. Without it, entries at almost no airflow
+would dominate the patterns."""
 _MOST_PASSES = 10
 """Most Newton steps with merged server groups."""
 _MOST_EXACT_PASSES = 2

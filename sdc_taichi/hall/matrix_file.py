@@ -1,4 +1,4 @@
-"""Recirculation matrices that a user brings in a file: R of shares, or D of heat."""
+"""Files with recirculation matrices: R, shares of exhaust air, or D, temperature rises."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_MATRIX_BYTES, ArrayFile, decoding, open_input
 
 MOST_MATRIX_RACKS = 8192
-"""Most racks of a hall with a matrix of the user's: half a gigabyte in f64."""
+"""Largest number of racks of a hall with a matrix of the user; the matrix takes 0.5 GB in f64."""
 MOST_D_K_PER_W = 1000.0
 """Highest valid entry of D, in K/W: a rack of 1 W that warms another's intake by 1,000 K."""
 
 _NPY_MAGIC = b"\x93NUMPY"
 _ROUND_OFF = 1e-9
-"""Negative shares, and negative entries of D over the largest, that are no more than rounding."""
+"""Size up to which negative shares, and negative entries of D divided by the largest, are rounding
+errors."""
 
 
 def read_matrix(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
@@ -149,7 +150,7 @@ def _read_csv(path: Path, file: BinaryIO) -> F64:
         decoding(path, "a matrix", ConfigError),
         warnings.catch_warnings(),
     ):
-        # Of a file without numbers, whose shape says so.
+        # NumPy warns about a file without numbers, which the check of the shape refuses.
         warnings.simplefilter("ignore", UserWarning)
         try:
             rows = (row for _, row in _rows(text))

@@ -1,4 +1,4 @@
-"""Weights of the exhaust mix before each rack: whose exhaust would reach its inlet, and how easily.
+"""Weights of the exhaust mix before each rack, by how easily each exhaust reaches its inlet.
 
 The weight w_ji of source rack i for rack j falls with the length d of the path from exhaust face to
 inlet face, exp(-d/decay), over the racks or around the ends of the rows, times the exhaust airflow
@@ -19,11 +19,12 @@ from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 from sdc_taichi.types import F64, I32, I64
 
 DENSE_RACKS = 64
-"""Most racks of a hall that keeps every weight; larger ones drop those below the cutoff."""
+"""Largest number of racks of a hall that keeps every weight; larger halls drop weights below the
+cutoff."""
 MERGED_RACKS_PER_ROW = 64
-"""Longest rows, in racks, that are summed whole: rows beside each other make one run."""
+"""Largest number of racks of a row that is kept whole, so that neighbouring rows make one run."""
 MOST_WEIGHTS = 2**27
-"""Most weights, or runs of weights, that a hall may keep: a gigabyte in f64."""
+"""Largest number of weights, or of runs, of a hall; they take 1 GB in f64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class MixWeights:
             yield rack[:runs], first_rack[:runs] + i, self.weights[first_weight[:runs] + i]
 
 
-_Runs = tuple[I32, ...]
+_Runs = tuple[I32, I32, I32, I32]
 """``run_offsets``, ``run_first_rack``, ``run_length`` and ``run_first_weight``."""
 
 
@@ -368,6 +369,11 @@ def _runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
     return _as_runs(run_offsets, first_rack, end - begin, first_weight)
 
 
-def _as_runs(*values: I64) -> _Runs:
-    """Values of ``_Runs`` as the 32-bit integers that the kernels take."""
-    return tuple(each.astype(np.int32) for each in values)
+def _as_runs(run_offsets: I64, first_rack: I64, length: I64, first_weight: I64) -> _Runs:
+    """Runs as the 32-bit integers that the kernels take."""
+    return (
+        run_offsets.astype(np.int32),
+        first_rack.astype(np.int32),
+        length.astype(np.int32),
+        first_weight.astype(np.int32),
+    )

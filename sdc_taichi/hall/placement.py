@@ -1,8 +1,8 @@
-"""Where in the hall a data center's work runs: its utilisation spread over racks or server groups.
+"""Placement of work: distribution of a data center's utilisation over its racks or server groups.
 
-Bins are the places for work, racks or groups of equal servers, those of all data centers end to
-end. What is placed is conserved: the loads, weighted by the servers of each bin, sum to the
-utilisation, as far as the usable servers suffice.
+Bins are the places for work, racks or groups of equal servers, in one array for all data centers.
+Work is conserved: the loads, weighted by the servers of each bin, sum to the utilisation, as far as
+the usable servers suffice.
 """
 
 from __future__ import annotations

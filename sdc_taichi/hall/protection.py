@@ -8,9 +8,9 @@ import numpy.typing as npt
 from sdc_taichi.types import F64, I64, Status, Values
 
 NORMAL, THROTTLED, TRIPPED = 0, 1, 2
-"""Status of a rack: works as asked, works less because it is too hot, or is off."""
+"""Status of a rack: in order, limited to ``throttle_share`` because it is too hot, or off."""
 LEAST_THROTTLE_SHARE = 0.1
-"""Least share of its rise over the inlet that the outlet of a throttled rack is taken to have."""
+"""Smallest throttle share by which the temperature rise of a throttled rack is divided."""
 
 Mask = npt.NDArray[np.bool_]
 

@@ -1,4 +1,4 @@
-"""Server groups of the racks of a hall as flat arrays, cut where servers meet different air."""
+"""Server groups of the racks of a hall as flat arrays, divided at the height zones of the air."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ NEIGHBOURS_M = 2.2
 LEAST = 0.15
 """Exposure of a rack for which the sum of the terms is 0; a rack of the mean has about 1."""
 _REACH = 40.0
-"""Distance of neighbours that still count, in lengths: their weight is that of a rounding."""
+"""Distance of the farthest neighbours that count, in lengths: their weight is a rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
 
     Args:
         config: A data center with inlet model ``recirculation``.
-        servers: Its ``rack_servers``, if at hand.
+        servers: Its ``rack_servers``; None computes them.
 
     Raises:
         ConfigError: a matrix that cannot be read or is no recirculation matrix, or approach
@@ -100,7 +100,7 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
     try:
         return _calibrated(config, servers, design)
     except ConfigError as error:
-        # What follows from a matrix is wrong because of it, if the hall alone is right.
+        # A hall that is valid without its matrix is invalid because of it.
         named = path is None or str(path) in str(error)
         raise ConfigError(str(error) if named else f"{path}: {error}") from None
 
@@ -169,7 +169,7 @@ def _from_matrix_file(
             f"{wanted_k[rack]:g} K of hall.supply_approach_k; valid is 0 K there or "
             "another hall.recirculation.calibrate than rack"
         )
-    # A rack that breathes supply air alone has a mix before it all the same: that of all racks.
+    # A rack that takes in supply air alone also has a mix before it: that of all racks.
     weights = dense_weights(
         np.where(none[:, None], 1.0 / len(sums), matrix / np.where(none, 1.0, sums)[:, None])
     )
@@ -342,7 +342,7 @@ def _settled(
 
 
 def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: F64) -> None:
-    """Make sure that no server would have to breathe more exhaust air than it takes in at all."""
+    """Check that exhaust air is less than the whole intake of every server."""
     worst = int(np.argmax(group_share))
     if group_share[worst] >= 1.0:
         rack = int(np.searchsorted(servers.group_offsets, worst, side="right")) - 1
@@ -356,7 +356,7 @@ def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: 
 def _check_airflows(
     config: DataCenterConfig, design: DesignPoint, weights: MixWeights, share: F64
 ) -> None:
-    """Make sure that racks take in no more of an exhaust than there is."""
+    """Check that racks together take in no more of an exhaust than there is."""
     left = design.airflow_m3s - weights.apply_transposed(share * design.airflow_m3s)
     worst = int(np.argmin(left))
     if left[worst] < 0:
@@ -385,7 +385,7 @@ def _open_fresh_share(config: DataCenterConfig, design: DesignPoint, share: F64)
 
 @dataclass(frozen=True, slots=True)
 class _Coefficients:
-    """How air comes to the inlets, by the place of the returns."""
+    """Coefficients of the exposure for one place of the returns."""
 
     around: float
     """Exposure at the very end of a row by what comes round it."""

@@ -1,8 +1,7 @@
-"""How CRAC units share the supply of the racks: their airflows, and whose air reaches whom.
+"""Supply of the racks by the CRAC units: airflow of each unit, and its share in each rack's supply.
 
-Units give their air to a plenum that they share. How much of a rack's supply comes from which unit
-depends on distance; where a unit gives less than is asked of it, as when it is down, air of the
-others takes its place.
+All units supply a common plenum. The share of a unit in a rack's supply depends on their distance;
+where a unit gives less than its share, as when it is down, air of the other units replaces it.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ _MOST_PRODUCTS = 2e8
 """Most products of share and weight in all passes, but for the least number of passes: about a
 second."""
 _WITHIN = 1e-13
-"""Relative difference of what units give and what is asked of them at which both agree."""
+"""Relative difference at which the airflow of units and that taken from them count as equal."""
 _LEAST_WEIGHT = 1e-12
-"""Least weight of a unit over its first: a unit that alone supplies a rack goes on supplying it."""
+"""Smallest weight of a unit, so that the only unit of a rack goes on supplying it."""
 
 
 def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
@@ -69,7 +68,7 @@ def unit_weights(shares: F64, rack_need_m3s: F64, given_m3s: F64) -> F64:
 
 
 def weighted_shares(shares: F64, weight: F64) -> F64:
-    """Shares of units with weights; rows sum to 1. A rack that has one unit alone keeps it.
+    """Shares of the units after weighting, (R, U); rows sum to 1. A rack with one unit keeps it.
 
     Args:
         shares: Shares of the units, (R, U).
@@ -86,7 +85,7 @@ def airflow_with_losses_m3s(
 ) -> F64:
     """Airflow of each unit at the design point where some are down, in m3/s, (U,).
 
-    The others make up for what is missing, all at one speed and as far as full speed goes.
+    The others replace the missing air, all at one speed and up to full speed.
 
     Args:
         full_m3s: Airflow of each unit at full speed, m3/s, (U,).

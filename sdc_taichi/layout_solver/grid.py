@@ -20,13 +20,13 @@ CELL_RANGE_M = (0.05, 2.0)
 DEFAULT_CELL_M = 0.3
 """Length of a cell unless another is asked for, in m."""
 LEAST_LEAK = 1e-3
-"""Share of its free area that containment always leaves open: gaps, and a flow that must balance
-even where racks draw more than the tiles of their closed aisle supply."""
+"""Smallest share of the free area that containment leaves open: for gaps, and because the flow must
+balance even where racks draw more air than the tiles of their closed aisle supply."""
 
 _EDGE = (0.25, 0.5)
-"""Cells at the edges of racks, in cells: potential flow is singular there."""
+"""Lengths of the cells at the edges of racks, where potential flow is singular, in cells."""
 _CELL_HEIGHT = 0.5
-"""Height of a cell over its length: halls are flat, and aisles are stratified."""
+"""Height of a cell divided by its length: halls are flat, and the air of aisles is stratified."""
 _WEST, _FRONT, _FLOOR, _EAST, _BACK, _CEILING = range(6)
 
 

@@ -1,7 +1,7 @@
-"""Layout solver: potential flow through a hall, tags of all rack exhausts, and their temperatures.
+"""Layout solver: potential flow through a hall, transport of the rack exhausts, and temperatures.
 
-For halls without a CFD study: the shares of exhaust air in the intake of every rack, and what they
-do at the design point. docs/layout-solver.md has the method and what it cannot say.
+It computes the shares of exhaust air in the intake of every rack for halls without a CFD study, and
+the temperatures at the design point. docs/layout-solver.md describes the method and its limits.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, buil
 from sdc_taichi.types import F64, I32
 
 MIXING_M = 0.3
-"""Eddy diffusivity over air speed, in m: half a floor tile. It is what upwind differences add on
-cells of 0.6 m, so that it bounds theirs at any finer one and results do not drift with the cell."""
+"""Eddy diffusivity divided by air speed, in m: half a floor tile. Upwind differences add as much on
+cells of 0.6 m; on smaller cells they add less, so that results do not depend on the cell length."""
 
 _TOLERANCE = 1e-13
-"""Residual of a linear system over its right side at which it counts as solved."""
+"""Residual of a linear system, divided by its right side, at which it counts as solved."""
 _MOST_ITERATIONS = 20_000
 """Most iterations for one linear system."""
 
@@ -60,14 +60,14 @@ class LayoutSolution:
     rci_lo_pct: float
     """Rack cooling index at the low end against the allowable range of the ASHRAE class, in %."""
     mass_residual: float
-    """Sum over the cells of air that appears or vanishes, over supply air."""
+    """Sum over the cells of air that appears or vanishes, divided by the supply air."""
     share_residual: float
     """Largest departure of a row of R and its share of supply air from 1."""
     energy_residual: float
-    """Heat that leaves by the returns less IT power, over IT power: the larger of that through R
-    and that of the temperatures solved on the grid."""
+    """Heat that leaves by the returns less IT power, divided by IT power: the larger value of that
+    computed with R and that of the temperatures solved on the grid."""
     direct_difference_k: float
-    """Largest difference of inlets through R and of those solved on the grid, in K."""
+    """Largest difference of inlets computed with R from those solved on the grid, in K."""
     cells: int
     """Cells that hold air."""
     seconds: float
@@ -396,7 +396,7 @@ def solve_at_design_point(
 def _provenance(
     config: DataCenterConfig, grid: Grid, cell_m: float, supply_m3s: float, supply_c: float
 ) -> dict[str, Any]:
-    """Where a matrix comes from; without time and place, so that equal solves are equal files."""
+    """Provenance of a matrix, without date and computer: equal solutions give equal files."""
     hall = config.hall
     return {
         "package": f"sdc-taichi {version('sdc-taichi')}",

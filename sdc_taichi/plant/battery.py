@@ -7,9 +7,9 @@ charge_kwh is drawn, discharge_kwh delivered, and
 
 to rounding; the released model has no losses and rounds its store to 8 decimals of a MWh.
 
-Every battery guards the grid connection: it charges with what the limit leaves beside the load,
-and where the load alone exceeds the limit it discharges to make up the difference, as far as its
-own limits allow and whatever the command says.
+Every battery protects the grid connection, whatever the command is: it charges only with the power
+that the limit leaves beside the load, and where the load alone exceeds the limit it discharges to
+cover the difference, as far as its own limits allow.
 
 Sources: F. Kazhamiaka, C. Rosenberg, S. Keshav, "Tractable lithium-ion storage models for
 optimizing energy systems", Energy Informatics 2 (2019); SustainDC, appendix A.3.4.
@@ -62,7 +62,7 @@ class BatteryPoint(NamedTuple):
     """Size of batteries and load of their facilities in one step."""
 
     capacity_kwh: Values
-    """Capacity, in kWh, (B,); 0 is a battery that is not there."""
+    """Capacity, in kWh, (B,); 0 means no battery."""
     load_kw: Values
     """Facility load, in kW, (B,); a discharge never delivers more."""
     dt_h: Values
@@ -70,7 +70,7 @@ class BatteryPoint(NamedTuple):
     parameters: BatteryParameters = BatteryParameters()
     """Parameters that the configuration gives."""
     grid_limit_kw: Values | None = None
-    """Most power that the grid connection carries, in kW, (B,); None is no limit."""
+    """Largest power of the grid connection, in kW, (B,); None is no limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +81,8 @@ class BatteryModel:
     """One step from the stored energy, in kWh, (B,), and the command, the share of the limit power
     at which the battery charges (up to 1) or discharges (down to -1), (B,)."""
     by_rate_of_store: bool = False
-    """Whether ``discharge_limit_c_rate`` limits the rate out of the store, which losses make larger
-    than the rate delivered."""
+    """Whether ``discharge_limit_c_rate`` limits the rate out of the store, which exceeds the rate
+    delivered by the losses."""
 
 
 def clc(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
@@ -207,7 +207,7 @@ def _step(
 def _within_grid_limit(
     charge_kwh: Values, discharge_kwh: Values, most_discharge_kwh: Values, point: BatteryPoint
 ) -> tuple[Values, Values]:
-    """Charge and discharge, kWh, that keep the grid connection within its limit if they can."""
+    """Charge and discharge, kWh, that keep the grid connection within its limit where possible."""
     if point.grid_limit_kw is None:
         return charge_kwh, discharge_kwh
     load_kwh, limit_kwh = point.load_kw * point.dt_h, point.grid_limit_kw * point.dt_h

@@ -1,9 +1,9 @@
 """Chillers: electric power for a cooling load, one record per model in ``CHILLERS``.
 
-A record names the equations of a model and all that the rest of the package has to know about it:
-where its condenser gives its heat, its reference COP, and the temperatures within which its curves
-hold. The names that ``hvac.chiller.model`` accepts, the plant of a chiller, sizing and the table of
-the documentation follow from the records.
+A record has the equations of a model and all other facts about it: whether its condenser is cooled
+by tower water or by outdoor air, its reference COP, and the temperatures within which its curves
+are valid. The names that ``hvac.chiller.model`` accepts, the plant of a chiller, its sizing and the
+table in the documentation are derived from the records.
 
 The equations take the load and a ``ChillerPoint`` of float64 arrays (B,), or anything that
 broadcasts to that shape, and read what they need. A load below zero counts as none. Temperatures
@@ -124,7 +124,7 @@ class ChillerPoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ChillerModel:
-    """A chiller model: its equations and what plants and sizing have to know about it."""
+    """A chiller model: its equations, and the facts that plants and sizing need."""
 
     equations: Callable[[Values, ChillerPoint], ChillerResult]
     """Power and heat for a cooling load in W, (B,), at a point within the bounds below."""

@@ -87,10 +87,10 @@ SETPOINTS: dict[str, SetpointModel] = {
 
 
 def avoid_repeats(command: F64, last: F64) -> F64:
-    """Cooling commands that differ from those of the step before, if only in the last bit.
+    """Cooling commands that differ from those of the step before at least in the last bit.
 
-    Setpoint model ``accelerating`` takes equal commands in a row for a wish to go faster and
-    multiplies them; a command that is computed means what it says.
+    Setpoint model ``accelerating`` multiplies equal commands in a row; commands that are computed
+    must not be multiplied.
 
     Args:
         command: setpoint changes, in steps, (n,).
@@ -128,7 +128,7 @@ def constant_flow(point: CracPoint) -> tuple[F64, F64]:
 
 
 def following_flow(point: CracPoint) -> tuple[F64, F64]:
-    """Airflow of fans that keep pace with the servers' airflow."""
+    """Airflow of fans whose speed follows the servers' airflow."""
     speed = np.clip(point.it_airflow_m3s / point.design_it_airflow_m3s, point.min_ratio, 1.0)
     return point.design_flow_m3s * speed, speed
 
@@ -245,8 +245,8 @@ COOLING_LOADS: dict[str, LoadModel] = {
 
 
 ROUND_OFF_SHARE = 1e-12
-"""Heat that differs by no more than this share is the same: sums of many devices hold no more
-digits, and their last bits depend on the processor."""
+"""Relative difference up to which two heat flows count as equal: sums over many devices have no
+more valid digits, and their last bits depend on the processor."""
 
 
 def balance_room_heat(
@@ -272,7 +272,7 @@ def balance_room_heat(
 def unmet_and_recovered(load_w: F64, heat_removed_w: F64) -> tuple[F64, F64]:
     """Load beyond the heat removed, and heat removed beyond the load.
 
-    Both are differences of sums that may agree; what rounding leaves of them is none.
+    Differences that are no more than rounding errors count as 0.
 
     Args:
         load_w: Cooling load, W, (B,).

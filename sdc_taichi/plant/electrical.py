@@ -17,7 +17,7 @@ import numpy as np
 from sdc_taichi.types import F64, Values
 
 NO_LIMIT_KW = 1e9
-"""Limit of a connection without one, in kW: no step draws as much."""
+"""Limit in kW that stands for no limit: no step draws as much."""
 ROUND_OFF_SHARE = 1e-9
 """Share of the limit by which rounding may exceed it."""
 

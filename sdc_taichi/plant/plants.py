@@ -1,4 +1,4 @@
-"""Plants: how the heat of the halls gets outdoors, models in ``PLANTS``.
+"""Plants, which move the heat of the halls outdoors: models in ``PLANTS``.
 
 A water-cooled plant rejects its heat by a cooling tower. Dry plants have an air-cooled chiller,
 whose power includes the fans of its condenser; nothing evaporates in them but in the humidifier of
@@ -32,7 +32,7 @@ _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
 
 
 class PlantPoint(NamedTuple):
-    """Air and weather with which plants work."""
+    """Air of the hall and weather in one step of a plant."""
 
     setpoint_c: F64
     """CRAC supply setpoint, in C, (B,)."""

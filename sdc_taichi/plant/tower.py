@@ -63,7 +63,7 @@ _LEAST_K = 1e-9
 
 
 class TowerPoint(NamedTuple):
-    """Weather, setpoints and sizes with which towers work."""
+    """Weather, setpoints and sizes in one step of the towers."""
 
     wet_bulb_c: Values
     """Outdoor wet bulb, in C, (B,)."""

@@ -24,7 +24,7 @@ PAPER_DRIFT_RATE = 0.01
 
 
 class WaterPoint(NamedTuple):
-    """How towers work in one step."""
+    """Operation of the towers in one step."""
 
     rejected_w: Values
     """Heat that the tower rejects, in W, (B,)."""

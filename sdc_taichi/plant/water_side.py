@@ -1,4 +1,4 @@
-"""What all plants share: their sized devices, the result of a step, and the chilled-water loop."""
+"""Parts that all plants share: sized devices, the result of a step, and the chilled-water loop."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from sdc_taichi.plant.chiller import ChillerParameters
 from sdc_taichi.types import F64, PlantQuantities, Values, as_array
 
 LEAST_COIL_LOAD = 0.1
-"""Least load of the coils over that at design below which the range of their water stays."""
+"""Load of the coils divided by that at design below which the range of their water is constant."""
 LEAST_OUTDOOR_UNITS = 0.01
-"""Least share of outdoor units with which equations are evaluated; without any they do nothing."""
+"""Smallest share of outdoor units with which equations are evaluated, so that none divides by 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,9 +193,9 @@ def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSid
 
 
 def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64, F64]:
-    """Heat that economiser and chiller have to take off the chilled water: of coils and pumps.
+    """Heat that economiser and chiller take off the chilled water: that of the coils and the pumps.
 
-    All that reaches the shaft of a pump ends as heat of the water, the losses of its motor do not
+    The power at the shaft of a pump ends as heat of the water; the losses of its motor do not
     (EnergyPlus Engineering Reference, "Pumps").
 
     Args:

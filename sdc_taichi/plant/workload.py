@@ -130,9 +130,10 @@ MODELS: dict[str, WorkModel] = {
 }
 """Models of work by the names that ``workload.model`` takes."""
 NEGLIGIBLE_TASKS = 1e-9
-"""Left by rounding where a step's work was taken out in parts; no age is read off it."""
+"""Amount of work that rounding may leave of a step whose work was taken out in parts; it has no
+age."""
 UNLIMITED_TASKS = 1e30
-"""Limit of a queue without one; larger than any, and still a number."""
+"""Limit in tasks that stands for no limit of a queue."""
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
