@@ -99,7 +99,7 @@ def test_tables_pictures_and_cells_of_a_suite(
     assert "Found: nothing.\n<!-- made-up -->\n" in page
     assert page.endswith("<!-- end -->\nNo more.\n")
     assert "\nold\n" not in page
-    assert "Made by `sdc-taichi benchmark made-up`." in page
+    assert "computed with `sdc-taichi benchmark made-up`." in page
     assert "| 1 | mpc-24h | -8.97 |" in page
     assert "[standings](benchmark/made-up-standings.csv)" in page
     board = pd.read_csv(docs / "benchmark" / "made-up-standings.csv")

@@ -134,8 +134,8 @@ def section(
         path = f"img/benchmark-{suite.name}.webp"
         write(docs / path, webp(picture.draw(), 80)[-1])
         parts.append(f"![Intervals of the rows of suite {suite.name}]({path})")
-        case = f"The picture is for case {board.case.name}."
-        end = f"{literal_markdown(f'{case} {picture.caption}')} {end}"
+        caption = picture.caption.replace("picture", f"picture of case {board.case.name}", 1)
+        end = f"{literal_markdown(caption)} {end}"
     parts.append(end)
     return [*parts, *(f"> {literal_markdown(text)}" for text in suite_notes(suite))]
 
