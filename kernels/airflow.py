@@ -170,15 +170,7 @@ def bicgstab_kernel() -> Any:
 
     SYSTEM_ARGUMENTS are its arguments.
     """
-    return define_kernel(
-        "solve_systems",
-        SYSTEM_ARGUMENTS,
-        run_slice,
-        precision="f64",
-        lanes=1,
-        constants={},
-        views={},
-    )
+    return define_kernel("solve_systems", SYSTEM_ARGUMENTS, run_slice, precision="f64")
 
 
 @ti.func

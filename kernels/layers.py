@@ -245,5 +245,4 @@ def layers_kernel(precision: str) -> Any:
         precision=precision,
         lanes=LANES,
         constants={"log_of": log_of, "exp_of": exp_of},
-        views={},
     )

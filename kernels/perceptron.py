@@ -27,7 +27,6 @@ def perceptron_kernel() -> Any:
         precision="f32",
         lanes=ROWS,
         constants={"exp_of": exp_of},
-        views={},
     )
 
 

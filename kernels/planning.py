@@ -33,19 +33,13 @@ from .planning_arguments import (
 @cache
 def queue_kernel() -> Any:
     """Kernel that plans the work of each data center; QUEUE_ARGUMENTS are its arguments."""
-    return _defined("plan_queues", QUEUE_ARGUMENTS, _queues_of_slice)
+    return define_kernel("plan_queues", QUEUE_ARGUMENTS, _queues_of_slice, precision="f64")
 
 
 @cache
 def store_kernel() -> Any:
     """Kernel that plans the battery of each data center; STORE_ARGUMENTS are its arguments."""
-    return _defined("plan_stores", STORE_ARGUMENTS, _stores_of_slice)
-
-
-def _defined(name: str, arguments: Any, run_slice: Any) -> Any:
-    return define_kernel(
-        name, arguments, run_slice, precision="f64", lanes=1, constants={}, views={}
-    )
+    return define_kernel("plan_stores", STORE_ARGUMENTS, _stores_of_slice, precision="f64")
 
 
 @ti.func

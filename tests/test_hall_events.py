@@ -12,7 +12,6 @@ from sdc_taichi import (
     Actions,
     DataCenterConfig,
     Drivers,
-    SdcError,
     Simulator,
     StepResult,
     build_fleet,
@@ -26,7 +25,7 @@ from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
-from test_transients import assert_same, part_of, run
+from simulated import actions_of, assert_same, part_of, random_actions, run
 
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 THERMAL = ("quasi_steady", "transient")
@@ -503,36 +502,6 @@ def test_policies_by_temperature_look_at_the_step_before() -> None:
     assert result.inlet_max_c[0] > 0
 
 
-@pytest.mark.parametrize(
-    ("policy", "actions", "message"),
-    [
-        ("uniform", {"fan": 1.0}, r"action fan: given, but hvac\.crac\.flow_model is"),
-        (
-            "uniform",
-            {"placement": np.ones(20)},
-            r"action placement: given, but workload\.placement is uniform",
-        ),
-        (
-            "weights",
-            {"placement": np.ones(7)},
-            r"action placement: shape \(7,\), expected \(20,\), one per rack",
-        ),
-        ("weights", {"placement": -np.ones(20)}, "placement weight 0 is -1"),
-        ("weights", {"placement": np.zeros(20)}, "all placement weights are 0"),
-    ],
-)
-def test_wrong_actions_are_refused(policy: str, actions: dict[str, Any], message: str) -> None:
-    config = hall_of([*LINEAR, f"workload.placement={policy}"])
-    with Simulator(config, drivers=constant()) as sim:
-        sim.reset()
-        sim.step()
-        before = sim.state_dict()
-        with pytest.raises(SdcError, match=message):
-            sim.step(Actions(**actions))
-        after = sim.state_dict()
-        assert all(np.array_equal(before[name], after[name]) for name in before)
-
-
 def test_throttled_racks_get_what_they_may_do() -> None:
     results = simulate(
         [*LINEAR, "workload.placement=fill", "hvac.crac.units=2", "protection.ashrae_class=A1",
@@ -606,33 +575,6 @@ def troubled_fleet(thermal: str, policy: str) -> list[DataCenterConfig]:
     ]
 
 
-def troubled_actions(
-    configs: list[DataCenterConfig], policy: str, steps: int, seed: int = 0
-) -> list[Actions]:
-    rng = np.random.default_rng(seed)
-    size, racks = len(configs), sum(c.hall.racks for c in configs)
-    return [
-        Actions(
-            rng.uniform(-1, 1, size),
-            rng.integers(-1, 2, size).astype(np.float64),
-            rng.uniform(-1, 1, size),
-            placement=rng.uniform(0, 1, racks) if policy == "weights" else None,
-        )
-        for _ in range(steps)
-    ]
-
-
-def actions_of(actions: Actions, configs: list[DataCenterConfig], index: int) -> Actions:
-    racks, one = np.cumsum([0, *(c.hall.racks for c in configs)]), slice(index, index + 1)
-    load, cooling, battery = (
-        np.asarray(getattr(actions, n))[one] for n in ("load", "cooling", "battery")
-    )
-    placement = actions.placement
-    if placement is not None:
-        placement = placement[racks[index] : racks[index + 1]]
-    return Actions(load, cooling, battery, placement=placement)
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("thermal", THERMAL)
 @pytest.mark.parametrize("policy", POLICIES)
@@ -640,7 +582,7 @@ def test_a_troubled_day_of_a_batch_equals_each_data_center_alone(
     policy: str, thermal: str, precision: Precision
 ) -> None:
     configs = troubled_fleet(thermal, policy)
-    actions = troubled_actions(configs, policy, 30)
+    actions = random_actions(30, configs, places=policy == "weights")
     with Simulator(configs, precision=precision) as sim:
         sim.reset(seed=4)
         batch = run(sim, actions)
@@ -662,7 +604,7 @@ def test_snapshots_in_the_midst_of_events_continue_to_the_bit(
     at: int, thermal: str, precision: Precision, tmp_path: Path
 ) -> None:
     configs = troubled_fleet(thermal, "coolest-first")
-    actions = troubled_actions(configs, "coolest-first", 26)
+    actions = random_actions(26, configs)
     with Simulator(configs, precision=precision) as sim:
         sim.reset(seed=9)
         first = run(sim, actions[:at])

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import os
 import subprocess
 import sys
-import weakref
+from collections.abc import Iterable
 from dataclasses import fields
 from functools import cache
 from typing import Any
@@ -22,9 +21,7 @@ from random_halls import fleet_of
 from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
-from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks
 from sdc_taichi.types import F64, ServerLayers
 
 # Data centers of any make-up move odd amounts of air.
@@ -172,58 +169,6 @@ def test_twin_sees_a_change_of_any_group_value(field: str) -> None:
     assert not same, f"{field} has no effect on CPU power"
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-@pytest.mark.parametrize("seed", [3, 4])
-def test_server_layers_are_the_values_of_their_group(precision: Precision, seed: int) -> None:
-    configs, supply_c, load = random_fleet(seed)
-    fleet = build_fleet(configs)
-    sums, servers = solve_servers(configs, supply_c, load, precision)
-    first, counts = fleet.server_offsets[:-1], np.diff(fleet.server_offsets)
-    for values in servers.values():
-        assert values.shape == (fleet.servers,)
-        assert values.dtype == np.dtype(np.float32 if precision == "f32" else np.float64)
-        assert np.array_equal(values, np.repeat(values[first], counts))
-    rel = TOLERANCE[precision]
-    rack_of = fleet.server_rack()
-    for total, layer in (
-        (sums.rack_cpu_w.astype(np.float64) + sums.rack_fan_w, servers["power_w"]),
-        (sums.rack_inlet_c * np.bincount(rack_of), servers["inlet_c"]),
-    ):
-        assert_close(total, np.bincount(rack_of, layer, fleet.racks), rel, "sum per rack")
-    first_server = fleet.server_offsets[fleet.group_offsets[:-1]]
-    hottest = np.maximum.reduceat(servers["inlet_c"], first_server)
-    assert np.array_equal(sums.rack_inlet_max_c, hottest)
-    hottest = np.maximum.reduceat(servers["outlet_c"], first_server)
-    assert_close(sums.rack_outlet_max_c, hottest, rel, "hottest outlet")
-
-
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-@settings(max_examples=10)
-@given(seed=SEEDS)
-def test_data_centers_are_the_sums_and_means_of_their_racks(
-    precision: Precision, seed: int
-) -> None:
-    configs, supply_c, load = random_fleet(seed)
-    fleet = build_fleet(configs)
-    sums = solve(configs, supply_c, load, precision)
-    racks = np.diff(fleet.rack_offsets)
-
-    def total(name: str) -> F64:
-        rack_values = getattr(sums, f"rack_{name}").astype(np.float64)
-        return np.asarray(np.bincount(fleet.rack_dc, rack_values, fleet.size), dtype=np.float64)
-
-    for name, of_rack in (
-        ("cpu_w", "cpu_w"),
-        ("it_fan_w", "fan_w"),
-        ("it_airflow_m3s", "airflow_m3s"),
-    ):
-        assert_close(getattr(sums, name), total(of_rack), 1e-14, name)
-    assert_close(sums.inlet_mean_c, total("inlet_c") / racks, 1e-14, "inlet")
-    assert_close(sums.outlet_mean_c, total("outlet_c") / racks, 1e-14, "outlet")
-    hottest = np.maximum.reduceat(sums.rack_inlet_max_c, fleet.rack_offsets[:-1])
-    assert np.array_equal(sums.inlet_max_c, hottest.astype(np.float64))
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("load", [0.0, 0.35, 0.8, 1.0])
 def test_load_weights_conserve_the_work_of_a_rack(seed: int, load: float) -> None:
@@ -253,14 +198,6 @@ def results_equal(one: HallSums, other: HallSums) -> bool:
     return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_a_second_run_is_equal_to_the_bit(precision: Precision) -> None:
-    fleet = random_fleet(6)
-    (first, layers), (second, again) = (solve_servers(*fleet, precision) for _ in range(2))
-    assert results_equal(first, second)
-    assert all(np.array_equal(layers[name], again[name]) for name in layers)
-
-
 def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> HallSums:
     """The sums of one data center of a fleet."""
     fleet = fleet_of(*configs)
@@ -272,47 +209,6 @@ def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> Hall
         begin, end = start.get(kind, whole)[index : index + 2]
         found[f.name] = getattr(sums, f.name)[begin:end]
     return HallSums(**found)
-
-
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-@pytest.mark.parametrize("outlet_model", OUTLETS)
-@settings(max_examples=6)
-@given(seed=SEEDS)
-def test_a_data_center_of_a_batch_equals_itself_alone(
-    precision: Precision, outlet_model: str, seed: int
-) -> None:
-    exponent = EXPONENTS[seed % len(EXPONENTS)]
-    configs, supply_c, load = random_fleet(seed, outlet_model, exponent)
-    batch = solve(configs, supply_c, load, precision)
-    for i, config in enumerate(configs):
-        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
-        assert results_equal(alone, part_of(batch, configs, i)), i
-
-
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_servers_of_a_batch_equal_themselves_alone(precision: Precision) -> None:
-    configs, supply_c, load = random_fleet(7)
-    fleet = build_fleet(configs)
-    assert fleet.size > 3
-    _, servers = solve_servers(configs, supply_c, load, precision)
-    start = fleet.server_offsets[fleet.group_offsets[fleet.rack_offsets]]
-    for i, config in enumerate(configs):
-        _, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
-        for name, values in servers.items():
-            assert np.array_equal(own[name], values[start[i] : start[i + 1]]), (i, name)
-
-
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_fan_exponents_may_differ_within_a_fleet(precision: Precision) -> None:
-    rng = np.random.default_rng(11)
-    configs = [
-        random_config(rng, f"dc{i}", "server", e) for i, e in enumerate((3.0, 1.0, 2.5, 3.0))
-    ]
-    supply_c, load = np.array([18.0, 20.0, 22.0, 24.0]), np.array([0.3, 0.5, 0.7, 0.9])
-    batch = solve(configs, supply_c, load, precision)
-    for i, config in enumerate(configs):
-        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
-        assert results_equal(alone, part_of(batch, configs, i)), f"dc{i}"
 
 
 @cache
@@ -330,29 +226,49 @@ def hall_of_many_racks(racks: int) -> DataCenterConfig:
     return config_from_dict(values | {"name": f"racks-{racks}"})
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_large_and_small_halls_in_one_fleet_equal_themselves_alone(precision: Precision) -> None:
-    sizes = (1, 63, 64, 65, 500, 2, 1100)
-    configs = [hall_of_many_racks(n) for n in sizes]
-    supply_c, load = np.linspace(16, 23, len(sizes)), np.linspace(0.1, 1, len(sizes))
-    batch = solve(configs, supply_c, load, precision)
-    for i, config in enumerate(configs):
-        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
-        assert results_equal(alone, part_of(batch, configs, i)), f"{sizes[i]} racks"
-
-
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_a_batch_for_all_threads_equals_small_ones_on_one(precision: Precision) -> None:
-    config = load_config("corrected")
-    count, rng = 90, np.random.default_rng(8)
-    supply_c, load = rng.uniform(15, 24, count), rng.uniform(0, 1, count)
-    batch, layers = solve_servers([config] * count, supply_c, load, precision)
-    assert build_fleet([config] * count).groups > SERIAL_GROUPS
-    for i in (0, 41, count - 1):
-        alone, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
-        assert results_equal(alone, part_of(batch, [config] * count, i)), i
+def assert_alone(
+    configs: list[DataCenterConfig],
+    supply_c: F64,
+    load: F64,
+    precision: Precision,
+    chosen: Iterable[int],
+) -> None:
+    """Data centers of a batch have the bits that they have alone, of sums and servers."""
+    fleet = fleet_of(*configs)
+    batch, layers = solve_servers(configs, supply_c, load, precision)
+    first = fleet.server_offsets[fleet.group_offsets[fleet.rack_offsets]]
+    for i in chosen:
+        alone, own = solve_servers([configs[i]], supply_c[i : i + 1], load[i : i + 1], precision)
+        assert results_equal(alone, part_of(batch, configs, i)), i
         for name, values in layers.items():
-            assert np.array_equal(own[name], values.reshape(count, -1)[i]), (i, name)
+            assert np.array_equal(own[name], values[first[i] : first[i + 1]]), (i, name)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("outlet_model", OUTLETS)
+@settings(max_examples=6)
+@given(seed=SEEDS)
+def test_a_data_center_of_a_batch_equals_itself_alone(
+    precision: Precision, outlet_model: str, seed: int
+) -> None:
+    exponent = EXPONENTS[seed % len(EXPONENTS)]
+    configs, supply_c, load = random_fleet(seed, outlet_model, exponent)
+    assert_alone(configs, supply_c, load, precision, range(len(configs)))
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_unlike_data_centers_of_a_batch_equal_themselves_alone(precision: Precision) -> None:
+    """Halls of any size, with fan exponents of their own; and more of them than one thread does."""
+    rng = np.random.default_rng(11)
+    configs = [hall_of_many_racks(n) for n in (1, 63, 64, 65, 500, 2, 1100)]
+    configs += [random_config(rng, f"dc{e}", "server", e) for e in (3.0, 1.0, 2.5)]
+    size = len(configs)
+    supply_c, load = np.linspace(16, 23, size), np.linspace(0.1, 1, size)
+    assert_alone(configs, supply_c, load, precision, range(size))
+    copies = [load_config("corrected")] * 90
+    assert fleet_of(*copies).groups > SERIAL_GROUPS
+    supply_c, load = rng.uniform(15, 24, 90), rng.uniform(0, 1, 90)
+    assert_alone(copies, supply_c, load, precision, (0, 41, 89))
 
 
 def digest_of_large_halls() -> str:
@@ -605,41 +521,6 @@ def test_groups_that_a_rack_has_not_do_not_count_for_its_hottest_outlet() -> Non
     first_server = fleet.server_offsets[fleet.group_offsets[:-1]]
     hottest = np.maximum.reduceat(hall.servers().outlet_c, first_server)
     assert_close(sums.rack_outlet_max_c, hottest, 1e-12, "hottest outlet")
-
-
-def test_results_stay_when_the_hall_is_solved_again() -> None:
-    hall = Hall(build_fleet(load_config("tiny")), "f32")
-    met = Conditions(np.array([20.0]), np.array([0.5]))
-    first = hall.solve(met)
-    before = [getattr(first, f.name).copy() for f in fields(first)]
-    hall.solve(Conditions(np.array([25.0]), np.array([0.9])))
-    assert all(
-        np.array_equal(getattr(first, f.name), kept)
-        for f, kept in zip(fields(first), before, strict=True)
-    )
-    assert results_equal(first, hall.solve(met))
-
-
-def test_layers_that_were_handed_out_are_not_kept() -> None:
-    with Simulator(load_config("tiny")) as sim:
-        sim.reset()
-        sim.step()
-        layers = sim.servers()
-        left = weakref.ref(layers.inlet_c.base)
-        del layers
-        gc.collect()
-        assert left() is None
-
-
-def test_copies_of_a_hall_share_the_inputs_of_their_groups() -> None:
-    runtime.ensure_started()
-    lengths = []
-    for count in (1, 3):
-        tables = build_hall_tables(build_fleet([load_config("tiny")] * count), np.float32, 1)
-        groups = tables.arrays["group_inputs"]
-        along, _ = build_rows_along_racks(groups, tables.arrays["block_ints"])
-        lengths.append((len(groups), len(along)))
-    assert lengths[0] == lengths[1]
 
 
 def test_layers_that_do_not_fit_are_refused() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gc
-import inspect
-import re
 import resource
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -26,41 +24,17 @@ from sdc_taichi import (
     SdcError,
     Simulator,
     StepResult,
-    drivers_from_arrays,
     load_config,
     load_drivers,
     make_configs,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.sim.drivers import FleetSeries
-from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
+from simulated import actions_of, assert_same, part_of, random_actions, run, short_drivers
 
 PRECISIONS: tuple[Precision, ...] = ("f32", "f64")
-
-
-def short_drivers(size: int = 1, steps: int = 96, seed: int = 0) -> Drivers:
-    rng = np.random.default_rng(seed)
-    wet_bulb = rng.uniform(-5, 24, (size, steps))
-    return drivers_from_arrays(
-        wet_bulb + 5,
-        wet_bulb,
-        rng.uniform(50, 600, (size, steps)),
-        rng.uniform(0, 1, (size, steps)),
-    )
-
-
-def random_actions(steps: int, size: int, seed: int = 0) -> list[Actions]:
-    rng = np.random.default_rng(seed)
-    return [
-        Actions(
-            rng.uniform(-1, 1, size),
-            rng.integers(-1, 2, size).astype(np.float64),
-            rng.uniform(-1, 1, size),
-        )
-        for _ in range(steps)
-    ]
+WEIGHTS = ["workload.placement=weights"]
 
 
 def mixed_fleet(preset: str = "corrected") -> list[DataCenterConfig]:
@@ -107,28 +81,7 @@ def results_of(
 ) -> list[StepResult]:
     with Simulator(configs, precision=precision, drivers=drivers) as sim:
         sim.reset()
-        return [sim.step(a) for a in actions]
-
-
-def assert_same(one: StepResult, other: StepResult, where: object = "") -> None:
-    for f in fields(one):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert np.array_equal(a, b), (f.name, where)
-
-
-def part_of(result: StepResult, configs: Sequence[DataCenterConfig], index: int) -> StepResult:
-    """What one data center did in a step of a fleet."""
-    start = np.concatenate([[0], np.cumsum([c.hall.racks for c in configs])])
-    values: dict[str, Any] = {}
-    for f in fields(result):
-        value = getattr(result, f.name)
-        if isinstance(value, np.ndarray):
-            # Every data center here has one CRAC unit.
-            is_rack = f.name.startswith("rack_")
-            part = slice(start[index], start[index + 1]) if is_rack else slice(index, index + 1)
-            value = value[part]
-        values[f.name] = value
-    return StepResult(**values)
+        return run(sim, actions)
 
 
 # --- repeatable ---------------------------------------------------------------------------------
@@ -144,40 +97,12 @@ def test_a_day_of_a_batch_equals_each_data_center_alone(
     fleet: Callable[[], list[DataCenterConfig]], precision: Precision
 ) -> None:
     configs = fleet()
-    actions = random_actions(96, len(configs), seed=2)
+    actions = random_actions(96, configs, seed=2)
     batch = results_of(configs, actions, precision)
     for i, config in enumerate(configs):
-        own = [
-            Actions(*(np.asarray(x)[i : i + 1] for x in (a.load, a.cooling, a.battery)))
-            for a in actions
-        ]
-        for together, alone in zip(batch, results_of([config], own, precision), strict=True):
-            assert_same(alone, part_of(together, configs, i), (i, alone.step))
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_reset_starts_the_same_run_again(precision: Precision) -> None:
-    configs = mixed_fleet()
-    actions = random_actions(40, len(configs))
-    with Simulator(configs, precision=precision) as sim:
-        sim.reset(seed=5)
-        first = [sim.step(a) for a in actions]
-        sim.reset(seed=5)
-        second = [sim.step(a) for a in actions]
-    third = results_of(configs, actions, precision)
-    for a, b, c in zip(first, second, third, strict=True):
-        assert_same(a, b)
-        assert_same(a, c)
-
-
-def test_results_of_a_step_stay_as_they_were() -> None:
-    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
-        sim.reset()
-        first = sim.step(Actions(LoadAction.DEFER, CoolAction.LOWER, BatteryAction.CHARGE))
-        before = {f.name: np.copy(getattr(first, f.name)) for f in fields(first)}
-        for _ in range(5):
-            sim.step(Actions(LoadAction.DRAIN, CoolAction.RAISE, BatteryAction.DISCHARGE))
-        assert all(np.array_equal(getattr(first, name), value) for name, value in before.items())
+        own = [actions_of(a, configs, i) for a in actions]
+        alone = results_of([config], own, precision)
+        assert_same(alone, [part_of(together, configs, i) for together in batch])
 
 
 RESULT_HALLS = {
@@ -205,14 +130,12 @@ def test_results_share_nothing_with_actions_and_later_steps(hall: str) -> None:
     with spoilt, kept:
         spoilt.reset()
         kept.reset()
-        for step, (given, same) in enumerate(
-            zip(random_actions(6, 2), random_actions(6, 2), strict=True)
-        ):
+        for given, same in zip(*(random_actions(6, configs) for _ in range(2)), strict=True):
             result, expected = spoilt.step(given), kept.step(same)
             for f in fields(Actions):
                 if isinstance(values := getattr(given, f.name), np.ndarray):
                     values[...] = -1
-            assert_same(result, expected, step)
+            assert_same([result], [expected])
             for f in fields(StepResult):
                 if isinstance(values := getattr(result, f.name), np.ndarray):
                     values[...] = -1
@@ -235,9 +158,8 @@ def test_enums_and_numbers_are_the_same_commands() -> None:
             for battery in BatteryAction:
                 named = Actions(load, cooling, battery)
                 numbers = Actions(float(load.value), float(cooling.value), float(battery.value))
-                pair = (results_of([config], [a] * 2, "f32", drivers) for a in (named, numbers))
-                for one, other in zip(*pair, strict=True):
-                    assert_same(one, other)
+                pair = [results_of([config], [a] * 2, "f32", drivers) for a in (named, numbers)]
+                assert_same(*pair)
 
 
 def test_series_repeat_after_their_end() -> None:
@@ -250,32 +172,6 @@ def test_series_repeat_after_their_end() -> None:
 
 
 # --- time step ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("per_hour", [1, 4, 12])
-def test_any_time_step_conserves(per_hour: int) -> None:
-    steps = 72 * per_hour
-    config = load_config("corrected", [f"simulation.steps_per_hour={per_hour}"])
-    actions = random_actions(steps, 1, seed=per_hour)
-    with Simulator(config) as sim:
-        assert sim.step_h == 1.0 / per_hour
-        sim.reset()
-        results = [sim.step(a) for a in actions]
-        stored = sim.state.stored_kwh
-
-    def total(name: str) -> float:
-        return float(np.sum([getattr(r, name) for r in results]))
-
-    assert all(r.step_h == 1.0 / per_hour for r in results)
-    arrived = total("arrived_tasks")
-    assert arrived == pytest.approx(
-        total("executed_tasks") + total("dropped_tasks") + results[-1].queue_tasks[0], rel=1e-12
-    )
-    assert total("it_kwh") == pytest.approx(total("it_w") / per_hour / 1e3, rel=1e-12)
-    assert total("it_w") + total("crac_fan_w") == pytest.approx(total("heat_removed_w"), rel=1e-12)
-    assert stored[0] == pytest.approx(
-        0.97 * total("charge_kwh") - 1.04 * total("discharge_kwh"), rel=1e-9
-    )
 
 
 def test_energy_of_a_day_does_not_depend_on_the_time_step() -> None:
@@ -294,22 +190,20 @@ def test_energy_of_a_day_does_not_depend_on_the_time_step() -> None:
 @pytest.mark.parametrize("preset", ["corrected", "sustaindc"])
 def test_a_snapshot_continues_to_the_bit(preset: str, precision: Precision, tmp_path: Path) -> None:
     configs = mixed_fleet(preset)
-    actions = random_actions(120, len(configs), seed=9)
+    actions = random_actions(120, configs, seed=9)
     with Simulator(configs, precision=precision) as sim:
         sim.reset()
-        for a in actions[:60]:
-            sim.step(a)
+        first = run(sim, actions[:60])
         snapshot = sim.state_dict()
         sim.save(tmp_path / "state.npz")
-        expected = [sim.step(a) for a in actions[60:]]
+        expected = run(sim, actions[60:])
         sim.load_state_dict(snapshot)
-        again = [sim.step(a) for a in actions[60:]]
+        assert_same(expected, run(sim, actions[60:]))
+        sim.reset()
+        assert_same(first + expected, run(sim, actions))
     with Simulator(configs, precision=precision) as other:
         other.load(tmp_path / "state.npz")
-        elsewhere = [other.step(a) for a in actions[60:]]
-    for one, second, third in zip(expected, again, elsewhere, strict=True):
-        assert_same(one, second)
-        assert_same(one, third)
+        assert_same(expected, run(other, actions[60:]))
     assert expected[0].step == 60
 
 
@@ -375,119 +269,88 @@ def test_a_wrong_snapshot_is_refused(
         (["servers.fan_reference_w=11"], "f32"),
         (["simulation.steps_per_hour=12"], "f32"),
         ([], "f64"),
+        (None, "f32"),
     ],
-    ids=["other config", "other time step", "other precision"],
+    ids=["other config", "other time step", "other precision", "other order"],
 )
 def test_a_snapshot_of_another_simulator_is_refused(
-    change: list[str], precision: Precision
+    change: list[str] | None, precision: Precision
 ) -> None:
-    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+    configs = grouped_fleet() if change is None else [load_config("tiny")]
+    others = configs[1:] + configs[:1] if change is None else [load_config("tiny", change)]
+    drivers = short_drivers(len(configs))
+    with Simulator(configs, drivers=drivers) as sim:
         sim.reset()
         snapshot = sim.state_dict()
-    other = load_config("tiny", change)
     with (
-        Simulator(other, drivers=short_drivers(), precision=precision) as sim,
+        Simulator(others, drivers=drivers, precision=precision) as sim,
         pytest.raises(SdcError, match="made by another fleet, inputs or precision"),
     ):
         sim.load_state_dict(snapshot)
 
 
-def test_a_snapshot_of_another_order_of_the_fleet_is_refused() -> None:
-    configs = grouped_fleet()
-    with Simulator(configs, drivers=short_drivers(3)) as sim:
-        sim.reset()
-        snapshot = sim.state_dict()
-    swapped = [configs[2], configs[1], configs[0]]
-    with (
-        Simulator(swapped, drivers=short_drivers(3)) as sim,
-        pytest.raises(SdcError, match="made by another fleet"),
-    ):
-        sim.load_state_dict(snapshot)
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"no zip archive", b"PK\x03\x04 cut off", b"\x93NUMPY\x01\x00 cut off"]
-)
-def test_a_file_that_is_no_snapshot_is_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "state.npz"
-    path.write_bytes(content)
-    with (
-        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(SdcError, match=r"state\.npz: cannot be read as an \.npz file"),
-    ):
-        sim.load(path)
-
-
-def test_an_array_file_or_half_a_snapshot_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_snapshot_is_refused(tmp_path: Path) -> None:
     with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
         sim.reset()
-        np.save(tmp_path / "array.npy", np.zeros(3))
         sim.save(tmp_path / "state.npz")
         whole = (tmp_path / "state.npz").read_bytes()
-        (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
-        damaged = bytearray(whole)
-        damaged[200:260] = bytes(60)
-        (tmp_path / "damaged.npz").write_bytes(damaged)
-        for name in ("array.npy", "half.npz", "damaged.npz"):
-            with pytest.raises(SdcError, match=f"{name}: cannot be read as"):
-                sim.load(tmp_path / name)
-
-
-def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
-    with (
-        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(SdcError, match=r"none\.npz: no such file"),
-    ):
-        sim.load(tmp_path / "none.npz")
-
-
-# --- documentation ------------------------------------------------------------------------------
-
-
-@pytest.mark.repo
-def test_the_docs_list_a_step_in_the_order_of_the_code() -> None:
-    docs = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
-    listed = docs.partition("## One step")[2].partition("## ")[0]
-    for function, pattern in (
-        (Simulator.step, r"^    ([A-Za-z_.]+) "),
-        (Facility.step, r"^      ([a-z_]+) "),
-    ):
-        names = re.findall(pattern, listed, re.MULTILINE)
-        source = inspect.getsource(function)
-        places = [source.find(f"{name}(") for name in names]
-        assert len(names) > 5
-        assert min(places) >= 0, names[places.index(min(places))]
-        assert places == sorted(places)
+        np.save(tmp_path / "array.npy", np.zeros(3))
+        array = (tmp_path / "array.npy").read_bytes()
+        damaged = whole[:200] + bytes(60) + whole[260:]
+        for content in (b"", b"no zip archive", whole[: len(whole) // 2], damaged, array):
+            (tmp_path / "other.npz").write_bytes(content)
+            with pytest.raises(SdcError, match=r"other\.npz: cannot be read as an \.npz file"):
+                sim.load(tmp_path / "other.npz")
+        with pytest.raises(SdcError, match=r"none\.npz: no such file"):
+            sim.load(tmp_path / "none.npz")
 
 
 # --- misuse -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("actions", "message"),
+    ("preset", "overrides", "action", "value", "message"),
     [
-        (Actions(load=1.5), r"action load: 1\.5; valid is a finite number within -1\.\.1"),
-        (Actions(battery=-1.01), r"action battery: -1\.01"),
-        (Actions(cooling=np.nan), "action cooling: nan"),
-        (Actions(cooling=np.inf), "action cooling: inf"),
-        (Actions(load=np.array([0.0, np.nan])), "action load: nan"),
-        (Actions(load=np.zeros(3)), r"action load: shape \(3,\), expected \(\) or \(2,\)"),
-        (Actions(battery=np.zeros((2, 1))), r"action battery: shape \(2, 1\)"),
-        (Actions(load=CoolAction.LOWER), "action load: CoolAction.LOWER is no LoadAction"),  # type: ignore[arg-type]
-        (Actions(battery="charge"), "action battery: 'charge' is neither"),  # type: ignore[arg-type]
-        (Actions(cooling=[BatteryAction.IDLE] * 2), "action cooling: .* is neither"),  # type: ignore[list-item]
+        ("tiny", [], "load", 1.5, r"load: 1\.5; valid is a finite number within -1\.\.1"),
+        ("tiny", [], "cooling", np.inf, "cooling: inf"),
+        ("tiny", [], "load", np.array([0.0, np.nan]), "load: nan"),
+        ("tiny", [], "load", np.zeros(3), r"load: shape \(3,\), expected \(\) or \(2,\)"),
+        ("tiny", [], "battery", np.zeros((2, 1)), r"battery: shape \(2, 1\)"),
+        ("tiny", [], "load", CoolAction.LOWER, "load: CoolAction.LOWER is no LoadAction"),
+        ("tiny", [], "battery", "charge", "battery: 'charge' is neither"),
+        ("tiny", [], "cooling", [BatteryAction.IDLE] * 2, "cooling: .* is neither"),
+        ("corrected", [], "fan", 1.0, "fan: given, but hvac.crac.flow_model is follow_servers"),
+        ("corrected", [], "placement", np.ones(40), "workload.placement is uniform"),
+        ("corrected", WEIGHTS, "placement", np.ones(7), r"shape \(7,\), expected \(40,\), one per"),
+        ("corrected", WEIGHTS, "placement", -np.ones(40), "placement weight 0 is -1"),
+        ("corrected", WEIGHTS, "placement", np.zeros(40), "all placement weights are 0"),
     ],
 )
-def test_a_wrong_action_is_refused_and_changes_nothing(actions: Actions, message: str) -> None:
-    configs = make_configs(load_config("tiny"), count=2)
+def test_a_wrong_action_is_refused_and_changes_nothing(
+    preset: str, overrides: list[str], action: str, value: Any, message: str
+) -> None:
+    configs = make_configs(load_config(preset, overrides), count=2)
     with Simulator(configs, drivers=short_drivers(2)) as sim:
         sim.reset()
         sim.step()
         before = sim.state_dict()
         with pytest.raises(SdcError, match=message):
-            sim.step(actions)
+            sim.step(Actions(**{action: value}))
         after = sim.state_dict()
         assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "7", True, 2**63])
+def test_wrong_arguments_are_refused(seed: Any) -> None:
+    with (
+        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
+        pytest.raises(ConfigError, match=r"valid is an integer of 0\.\.2\*\*63 - 1"),
+    ):
+        sim.reset(seed=seed)
+    with pytest.raises(ConfigError, match="'f16': valid are f32 and f64"):
+        Simulator(load_config("tiny"), precision="f16")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="drivers of 2 data centers for a fleet of 1"):
+        Simulator(load_config("tiny"), drivers=short_drivers(2))
 
 
 def test_steps_need_a_reset() -> None:
@@ -515,22 +378,6 @@ def test_a_closed_simulator_says_so() -> None:
     for use in uses:
         with pytest.raises(RuntimeStateError, match="is closed"):
             use()
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, "7", True, 2**63])
-def test_a_wrong_seed_is_refused(seed: Any) -> None:
-    with (
-        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(ConfigError, match=r"valid is an integer of 0\.\.2\*\*63 - 1"),
-    ):
-        sim.reset(seed=seed)
-
-
-def test_wrong_arguments_of_a_simulator() -> None:
-    with pytest.raises(ConfigError, match="'f16': valid are f32 and f64"):
-        Simulator(load_config("tiny"), precision="f16")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="drivers of 2 data centers for a fleet of 1"):
-        Simulator(load_config("tiny"), drivers=short_drivers(2))
 
 
 @pytest.mark.parametrize("preset", ["tiny", "transient"])
@@ -590,27 +437,6 @@ def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
     assert resident_mb() - before < 10.0
 
 
-def test_server_layers_are_given_back() -> None:
-    config = load_config("large", ["hall.servers_per_rack=2000", "servers.power_w=[25, 2]"])
-    drivers = short_drivers(steps=4)
-    layer_mb = 3 * 4 * config.hall.racks * 2000 / 1e6
-
-    def cycle() -> None:
-        with Simulator(config, drivers=drivers) as sim:
-            sim.reset()
-            sim.step()
-            assert sim.servers().power_w.shape == (config.hall.racks * 2000,)
-
-    for _ in range(2):
-        cycle()
-    gc.collect()
-    before = resident_mb()
-    for _ in range(12):
-        cycle()
-    gc.collect()
-    assert resident_mb() - before < 2 * layer_mb
-
-
 # --- inputs -------------------------------------------------------------------------------------
 
 
@@ -624,12 +450,6 @@ def test_drivers_follow_site_season_and_trace() -> None:
     july = load_drivers([configs[1]])
     assert july.start[0] == 181 * 96
     assert july.outdoor_c.at(july.start)[0] > table[2]
-
-
-def test_tables_gather_one_entry_per_data_center() -> None:
-    table = FleetSeries(np.array([1.0, 2.0, 3.0, 10.0, 20.0]), np.array([0, 3]), np.array([3, 2]))
-    found = [table.at(np.array([i, i])).tolist() for i in range(4)]
-    assert found == [[1, 10], [2, 20], [3, 10], [1, 20]]
 
 
 @pytest.mark.parametrize("preset", ["corrected", "paper", "sustaindc"])

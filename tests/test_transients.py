@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,11 +27,9 @@ from random_halls import (
 )
 from sdc_taichi import (
     Actions,
-    ConfigError,
     DataCenterConfig,
     Drivers,
     Simulator,
-    StepResult,
     build_fleet,
     drivers_from_arrays,
     load_config,
@@ -406,27 +403,6 @@ def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision,
     assert sums.coil_w[0] == pytest.approx(through - 1.0, rel=rel)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=4)
-@given(seed=SEEDS)
-def test_settled_halls_stay_settled(precision: Precision, seed: int) -> None:
-    configs, rng = random_halls(seed), np.random.default_rng(seed)
-    fleet = fleet_of(*configs)
-    met = replace(random_conditions(rng, configs), powered=None)
-    met = replace(met, unit_running=np.ones(fleet.units))
-    hall = Hall(fleet, precision)
-    state = hall.steady_state(met)
-    coil = Coil(
-        met.unit_supply_c, np.zeros(fleet.size), np.ones(fleet.size),
-        np.full(fleet.size, 1e12), np.zeros(fleet.size),
-    )  # fmt: skip
-    sums, after = hall.advance(met, state, coil, 900.0, 60.0)
-    atol = {"f64": 1e-4, "f32": 1e-2}[precision]
-    np.testing.assert_allclose(after.server_c, state.server_c, rtol=0, atol=atol)
-    np.testing.assert_allclose(after.mixed_c, state.mixed_c, rtol=0, atol=atol)
-    assert np.all(np.abs(sums.thermal_storage_w) <= 1e-4 * (sums.cpu_w + sums.it_fan_w) + 1e-6)
-
-
 def test_a_failed_unit_is_felt_over_steps_and_forgotten_again() -> None:
     event = "[{kind: crac_down, unit: 0, start_h: 2, duration_h: 1.5}]"
     base = load_config("corrected", ["simulation.thermal=transient", "hvac.crac.units=2"])
@@ -536,105 +512,3 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
         for f in fields(layers):
             found = getattr(layers, f.name)[part.servers]
             assert np.array_equal(getattr(alone.servers(), f.name), found), (config.name, f.name)
-
-
-def run(sim: Simulator, actions: list[Actions]) -> list[StepResult]:
-    return [sim.step(a) for a in actions]
-
-
-def random_actions(steps: int, size: int, seed: int = 0) -> list[Actions]:
-    rng = np.random.default_rng(seed)
-    return [
-        Actions(
-            rng.uniform(-1, 1, size),
-            rng.integers(-1, 2, size).astype(np.float64),
-            rng.uniform(-1, 1, size),
-        )
-        for _ in range(steps)
-    ]
-
-
-def assert_same(ones: list[StepResult], others: list[StepResult]) -> None:
-    for one, other in zip(ones, others, strict=True):
-        for f in fields(one):
-            a, b = getattr(one, f.name), getattr(other, f.name)
-            assert np.array_equal(a, b), (f.name, one.step)
-
-
-def transient_fleet() -> list[DataCenterConfig]:
-    """Halls of different size, units, servers and season."""
-    base = load_config("corrected", ["simulation.thermal=transient"])
-    changes: list[list[str]] = [
-        [],
-        ["hvac.crac.units=3", "site.location=AZ", "site.start=07-01"],
-        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-         "hall.return_approach_k=-3", "servers.power_w=[300, 60]", "hall.servers_per_rack=7",
-         "servers.heat_capacity_kj_per_k=4"],
-    ]  # fmt: skip
-    return [
-        apply_overrides(base, change).model_copy(update={"name": f"dc{i}"})
-        for i, change in enumerate(changes)
-    ]
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_transient_runs_repeat_and_resume_to_the_bit(precision: Precision, tmp_path: Path) -> None:
-    configs = transient_fleet()
-    actions = random_actions(30, len(configs))
-    with Simulator(configs, precision=precision) as sim:
-        sim.reset()
-        first = run(sim, actions[:13])
-        snapshot = sim.state_dict()
-        sim.save(tmp_path / "state.npz")
-        second = run(sim, actions[13:])
-        sim.load_state_dict(snapshot)
-        assert_same(second, run(sim, actions[13:]))
-        sim.reset()
-        assert_same(first + second, run(sim, actions))
-    with Simulator(configs, precision=precision) as other:
-        other.load(tmp_path / "state.npz")
-        assert_same(second, run(other, actions[13:]))
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_a_transient_day_of_a_batch_equals_each_data_center_alone(precision: Precision) -> None:
-    configs = transient_fleet()
-    actions = random_actions(24, len(configs), seed=2)
-    with Simulator(configs, precision=precision) as sim:
-        sim.reset()
-        batch = run(sim, actions)
-    for i, config in enumerate(configs):
-        own = [
-            Actions(*(np.asarray(getattr(a, n))[i : i + 1] for n in ("load", "cooling", "battery")))
-            for a in actions
-        ]
-        with Simulator(config, precision=precision) as sim:
-            sim.reset()
-            assert_same(run(sim, own), [part_of(r, configs, i) for r in batch])
-
-
-def test_substeps_are_those_of_the_whole_fleet() -> None:
-    base = load_config("corrected", ["simulation.thermal=transient"])
-    configs = [
-        apply_overrides(base, [f"simulation.substep_s={s}"]).model_copy(update={"name": f"dc{s}"})
-        for s in (60, 20)
-    ]
-    with pytest.raises(ConfigError, match=r"simulation\.substep_s is 60\.0 in dc60 and 20\.0 in"):
-        build_fleet(configs)
-
-
-def part_of(result: StepResult, configs: list[DataCenterConfig], index: int) -> StepResult:
-    """What one data center did in a step of a fleet."""
-    racks = np.cumsum([0, *(c.hall.racks for c in configs)])
-    units = np.cumsum([0, *(c.hvac.crac.units for c in configs)])
-    values: dict[str, Any] = {}
-    for f in fields(result):
-        value = getattr(result, f.name)
-        if isinstance(value, np.ndarray):
-            where = slice(index, index + 1)
-            if f.name.startswith(("rack_", "unit_")):
-                start = racks if f.name.startswith("rack_") else units
-                where = slice(start[index], start[index + 1])
-            value = value[where]
-        values[f.name] = value
-    return StepResult(**values)

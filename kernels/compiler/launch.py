@@ -44,7 +44,7 @@ def _build(builder: Any, context: Any, node: Any) -> Any:
 
 
 OPTIONS = {"fast_math": False, "real_matrix_scalarize": False}
-"""Options that kernels are compiled with, whoever started the runtime.
+"""Options that kernels are compiled with, also in a runtime that another library started.
 
 Without ``fast_math`` a sum has the same bits in every kernel. Without ``real_matrix_scalarize`` a
 vector is loaded, stored and computed as one vector of the processor."""
@@ -166,7 +166,7 @@ class _Launch:
 def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
     """Translate a kernel for such arguments; return the key by which Taichi finds it.
 
-    Whole numbers in kernels have 32 bits, whatever whoever started the runtime chose.
+    Whole numbers in kernels have 32 bits, whatever the options of the runtime.
     """
     runtime = ti.lang.impl.get_runtime()
     before = runtime.default_ip

@@ -3,6 +3,7 @@
 import linecache
 from collections import namedtuple
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import taichi as ti
@@ -88,6 +89,7 @@ def shared(**values: Any) -> Any:
     return namedtuple("Shared", values)(**values)
 
 
+_NONE: Mapping[str, Any] = MappingProxyType({})
 _SOURCE = """\
 @ti.kernel
 def {name}({parameters}):
@@ -107,9 +109,9 @@ def define_kernel(
     run_slice: Callable[..., None],
     *,
     precision: str,
-    lanes: int,
-    constants: Mapping[str, Any],
-    views: Mapping[str, tuple[Mapping[str, str], str]],
+    lanes: int = 1,
+    constants: Mapping[str, Any] = _NONE,
+    views: Mapping[str, tuple[Mapping[str, str], str]] = _NONE,
 ) -> Any:
     """Taichi kernel with the arguments of a spec.
 
@@ -123,7 +125,7 @@ def define_kernel(
         precision: ``f32`` or ``f64``, the type of ``real`` arguments.
         lanes: length of ``zeros``.
         constants: values known when the kernel is compiled, by name.
-        views: by name, rows that are told by the place of the first in an array of one dimension,
+        views: by name, rows that are found by the place of the first in an array of one dimension,
             and the name of that array.
     """
     real = reals(precision)

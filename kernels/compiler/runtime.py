@@ -40,7 +40,7 @@ def processor_quota(
     Returns:
         The least quota of the groups and those above, rounded up.
     """
-    found = [math.inf]
+    quotas = [math.inf]
     for line in _text(groups).split("\n"):
         number, _, rest = line.partition(":")
         controllers, _, path = rest.partition(":")
@@ -55,8 +55,8 @@ def processor_quota(
                 continue
             # "max" or -1 without a quota.
             if quota_us.strip().isdecimal() and period_us.strip().isdecimal() and int(period_us):
-                found.append(max(1, math.ceil(int(quota_us) / int(period_us))))
-    return min(found)
+                quotas.append(max(1, math.ceil(int(quota_us) / int(period_us))))
+    return min(quotas)
 
 
 def _text(file: Path) -> str:
@@ -121,14 +121,14 @@ def taichi_environment() -> Iterator[None]:
     """
     hidden = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("TI_")}
     hidden |= {name: os.environ[name] for name in _OWN if name in os.environ}
-    own = dict(_OWN)
+    set_here = dict(_OWN)
     if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():
-        own["HOME"] = os.sep
-    os.environ.update(own)
+        set_here["HOME"] = os.sep
+    os.environ.update(set_here)
     try:
         yield
     finally:
-        for name in own:
+        for name in set_here:
             os.environ.pop(name, None)
         os.environ.update(hidden)
 
@@ -224,7 +224,7 @@ _known: tuple[object, int] = (None, 0)
 
 
 def _mark_child() -> None:
-    """Remember in a forked child that its parent had a runtime, whoever started it."""
+    """Remember in a forked child that its parent had a runtime, its own or another library's."""
     global _forked
     taichi = sys.modules.get("taichi")
     _forked = taichi is not None and taichi.cfg is not None
@@ -302,17 +302,11 @@ def _start_taichi() -> None:
     """Start Taichi.
 
     Raises:
-        RuntimeStateError: memory is short, or there is no current folder.
+        RuntimeStateError: memory is short.
         ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
     """
     import taichi as ti
 
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise RuntimeStateError(
-            "the current folder has been deleted; valid is one that exists, which Taichi needs"
-        ) from None
     threads = _thread_limit() or int(min(len(allowed_processors()), processor_quota()))
     before = _thread_ids()
     folder = kernel_folder()

@@ -1,4 +1,4 @@
-"""How far controllers come between idle commands and a known optimum of equal inputs.
+"""Share of the achievable: how much of a known optimum's saving over idle commands a run reaches.
 
 The share of the achievable is 0 for a controller that does as well as idle commands, and 1 for one
 that does as well as the optimum's achieved path. Energy stored and work that waits at the end are
@@ -7,7 +7,7 @@ valued, so that an empty battery is no saving (``Optimum.end_value``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.rollout import LEAST_K, LEAST_TASKS
 from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
+from sdc_taichi.run.metrics import finite_or_none
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, Actions, StepResult
 
@@ -50,7 +51,7 @@ class AchievedPath:
 
 @dataclass(frozen=True, slots=True)
 class Achievement:
-    """What a controller reached, beside a known optimum of B data centers."""
+    """Score of a controller compared with a known optimum, of B data centers."""
 
     controller: str
     """Name of the controller."""
@@ -68,7 +69,7 @@ class Achievement:
 
 
 def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
-    """What a controller reached, from the score of its run.
+    """Compare the score of a run with a known optimum.
 
     Args:
         optimum: known optimum of the same configs, inputs and steps.
@@ -173,7 +174,7 @@ def begin_score(optimum: Optimum, sim: Simulator, seed: int) -> Score:
 
 
 def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) -> None:
-    """Put a run beside a known optimum, in the content of its metrics.json.
+    """Add the comparison with a known optimum to the content of metrics.json.
 
     Args:
         content: content of metrics.json, which is added to.
@@ -195,15 +196,12 @@ def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) 
         "broken": [list(texts) for texts in reached.broken],
     }
     for i, dc in enumerate(content["data_centers"]):
-        own = {name: values[i] for name, values in figures.items()}
-        dc["metrics"] |= _numbers(own | {"achievable_share": reached.share[i]})
+        of_dc = {name: values[i] for name, values in figures.items()}
+        of_dc["achievable_share"] = reached.share[i]
+        dc["metrics"] |= {name: finite_or_none(x) for name, x in of_dc.items()}
     total = {name: values.sum() for name, values in figures.items()}
-    content["total"] |= _numbers(total | {"achievable_share": reached.total_share})
-
-
-def _numbers(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Numbers for JSON, which has no nan."""
-    return {name: float(x) if np.isfinite(x) else None for name, x in values.items()}
+    total["achievable_share"] = reached.total_share
+    content["total"] |= {name: finite_or_none(x) for name, x in total.items()}
 
 
 def _broken(optimum: Optimum, score: Score, dc: int) -> list[str]:

@@ -23,6 +23,7 @@ from sdc_taichi.config.event_schema import PLANT_OF_EVENT
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
+from sdc_taichi.run.metrics import finite_or_none
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
@@ -42,7 +43,7 @@ MOST_LOSSES = 200
 MOST_UNIT_SHARES = 100_000_000
 """Most shares of units in the supply of racks, over all losses of a study: some 2 GB."""
 SHOWN_AFTER_MIN = (15, 60)
-"""Minutes after which the hottest inlet is told."""
+"""Minutes after which studies report the hottest inlet."""
 DEVICES: dict[EventKind, str] = {
     "chiller_derate": "chiller",
     "pump_down": "chilled-water pumps",
@@ -136,8 +137,8 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     site = load_drivers([config])
     sizing, ones = config.hvac.sizing, np.ones(MINUTES)
     outdoor_c, wet_bulb_c = (
-        float(found[0]) if given is None else given
-        for found, given in (
+        float(of_site[0]) if configured is None else configured
+        for of_site, configured in (
             (site.design_outdoor_c, sizing.design_outdoor_c),
             (site.design_wet_bulb_c, sizing.design_wet_bulb_c),
         )
@@ -249,17 +250,17 @@ def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
 
 
 def _kept(result: StepResult, step: int) -> dict[str, Any]:
-    """What a study keeps of a step, copied."""
-    kept: dict[str, Any] = {
+    """Quantities of a step that a study needs, copied."""
+    values: dict[str, Any] = {
         "inlet_max_c": result.inlet_max_c,
         "tripped": result.tripped_racks,
         "hot": result.throttled_racks + result.tripped_racks,
     }
     if step == 0:
-        kept["it_w"] = result.it_w
+        values["it_w"] = result.it_w
     if step == SHOWN_AFTER_MIN[0] - 1:
-        kept["rack_inlet_c"] = result.rack_inlet_max_c
-    return {name: np.array(values, dtype=np.float64) for name, values in kept.items()}
+        values["rack_inlet_c"] = result.rack_inlet_max_c
+    return {name: np.array(each, dtype=np.float64) for name, each in values.items()}
 
 
 def _first_minute(happens: Any) -> F64:
@@ -283,15 +284,11 @@ def failover_values(study: Failover) -> dict[str, Any]:
 
 def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]:
     """Losses in an order, each as plain values: units are in the keys, None is never."""
-
-    def number(value: float) -> float | None:
-        return None if np.isnan(value) else float(value)
-
     return [
         {
             "lost": study.losses[i].name,
-            "time_to_throttle_min": number(study.throttle_min[i]),
-            "time_to_trip_min": number(study.trip_min[i]),
+            "time_to_throttle_min": finite_or_none(study.throttle_min[i]),
+            "time_to_trip_min": finite_or_none(study.trip_min[i]),
             **{
                 f"hottest_inlet_{minute}_min_c": float(study.inlet_max_c[minute - 1, i])
                 for minute in SHOWN_AFTER_MIN

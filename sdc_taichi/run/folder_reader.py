@@ -115,8 +115,8 @@ def read_run(folder: str | Path) -> RunFolder:
     """
     path = Path(folder)
     if not os.path.isdir(path):
-        found = "is a file" if os.path.exists(path) else "no such folder"
-        raise SdcError(f"{path}: {found}; valid is a folder that simulate wrote a run to")
+        problem = "is a file" if os.path.exists(path) else "no such folder"
+        raise SdcError(f"{path}: {problem}; valid is a folder that simulate wrote a run to")
     run = RunFolder(path, _read_metrics(path / METRICS_FILE))
     _check_steps_file(run)
     return run
@@ -339,17 +339,17 @@ def _check_event(place: str, event: Mapping[str, Any], done: int) -> None:
 def _check_fields(
     path: Path,
     where: str,
-    given: Mapping[str, Any],
+    values: Mapping[str, Any],
     expected: Mapping[str, type | tuple[type, ...]],
 ) -> None:
     """Check that the fields of a JSON object are there and of their types."""
     for name, kind in expected.items():
-        value = given.get(name)
+        value = values.get(name)
         # A bool is an int in Python, and no number here.
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            found = f"is {value!r}" if name in given else "is missing"
+            problem = f"is {value!r}" if name in values else "is missing"
             names = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-            raise SdcError(f"{path}: {where}{name} {found}; valid is of type {names}")
+            raise SdcError(f"{path}: {where}{name} {problem}; valid is of type {names}")
 
 
 def _check_steps_file(run: RunFolder) -> None:
@@ -377,8 +377,8 @@ def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
     others = ("data_centers", "steps_done", "total", "configs_yaml", "optimum")
     out = {name: value for name, value in content.items() if name not in others}
     for index, dc in enumerate(content.get("data_centers", ())):
-        own = {name: value for name, value in dc.items() if name not in ("metrics", "events")}
-        out |= {f"data_centers[{index}].{name}": value for name, value in own.items()}
+        fields = {name: value for name, value in dc.items() if name not in ("metrics", "events")}
+        out |= {f"data_centers[{index}].{name}": value for name, value in fields.items()}
     return out
 
 

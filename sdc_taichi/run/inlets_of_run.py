@@ -56,13 +56,13 @@ def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
     if not isinstance(values, dict):
         raise SdcError(f"{place} is {shortened(values)}; valid is an object")
     try:
-        found = air_from_values(
+        hottest = air_from_values(
             values, racks=fleet.racks, units=fleet.units, steps=run.metrics["steps_done"]
         )
     except ValueError as error:
         raise SdcError(f"{place}: {error}") from None
     hottest_c = float(run.metrics["data_centers"][dc]["metrics"]["hottest_inlet_c"])
-    return InletsAtStep(found.step, hottest_c, fleet.configs[0], Inlets(fleet, 0, found.air))
+    return InletsAtStep(hottest.step, hottest_c, fleet.configs[0], Inlets(fleet, 0, hottest.air))
 
 
 def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
@@ -110,6 +110,6 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
 def _fleet_of(run: RunFolder, dc: int) -> Fleet:
     """A fleet of one data center of a run."""
     with warnings.catch_warnings():
-        # Whoever simulated the run has seen them.
+        # The run itself has given these warnings.
         warnings.simplefilter("ignore", OddInputWarning)
         return build_fleet(read_configs(run, [dc]))

@@ -115,6 +115,11 @@ class Totals:
     """Highest power of each month."""
 
 
+def finite_or_none(value: float) -> float | None:
+    """A number for JSON, which has neither nan nor infinities."""
+    return float(value) if np.isfinite(value) else None
+
+
 def empty_totals(size: int, step_h: float) -> Totals:
     """Totals of no steps.
 
@@ -169,7 +174,7 @@ def add_step(totals: Totals, result: StepResult) -> None:
 
 def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
-    found_min = times_to_throttle_min(totals)
+    throttle_min = times_to_throttle_min(totals)
     demand_charge = _demand_charge(totals, fleet)
     out = []
     for dc in range(fleet.size):
@@ -190,7 +195,7 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
                 ),
                 "over_27_degree_h": sums["over_27_mean_k"] * totals.step_h,
                 "rci_hi_min_pct": float(totals.rci_hi_min_pct[dc]),
-                "time_to_throttle_min": found_min[dc],
+                "time_to_throttle_min": throttle_min[dc],
                 "hottest_step": int(totals.hottest_step[dc]),
             }
         )
@@ -209,7 +214,7 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
     servers = fleet.per_dc_servers()
-    found_min = times_to_throttle_min(totals)
+    throttle_min = times_to_throttle_min(totals)
     cost = _cost(
         sums, float(_demand_charge(totals, fleet).sum()), float(totals.demand.peak_kw.max())
     )
@@ -228,7 +233,7 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
         / servers.sum()
         * totals.step_h,
         "rci_hi_min_pct": float(totals.rci_hi_min_pct.min()),
-        "time_to_throttle_min": min((x for x in found_min if x is not None), default=None),
+        "time_to_throttle_min": min((x for x in throttle_min if x is not None), default=None),
         "hottest_step": int(totals.hottest_step[hottest]),
     }
 
@@ -239,10 +244,10 @@ def times_to_throttle_min(totals: Totals) -> list[float | None]:
     To the end of the step in which it throttles; None without events or throttled racks.
     """
     steps = totals.first_throttle_step + 1 - totals.first_event_step
-    found = totals.first_throttle_step >= 0
+    throttles = totals.first_throttle_step >= 0
     return [
-        float(n * totals.step_h * 60.0) if is_found else None
-        for n, is_found in zip(steps, found, strict=True)
+        float(n * totals.step_h * 60.0) if throttled else None
+        for n, throttled in zip(steps, throttles, strict=True)
     ]
 
 

@@ -19,6 +19,7 @@ from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, Achievement
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_writer import OPTIMUM_FILE, metrics_json, simulate_to_folder, write_text
+from sdc_taichi.run.metrics import finite_or_none
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
 from sdc_taichi.user_file import MOST_METRICS_BYTES, read_text
@@ -58,12 +59,12 @@ def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> di
         "controllers": [
             {
                 "controller": each.controller,
-                "share": _or_none(each.total_share),
+                "share": finite_or_none(each.total_share),
                 "data_centers": [
                     {
                         "figure": float(each.figure[dc]),
-                        "valued_figure": _or_none(each.valued_figure[dc]),
-                        "share": _or_none(each.share[dc]),
+                        "valued_figure": finite_or_none(each.valued_figure[dc]),
+                        "share": finite_or_none(each.share[dc]),
                         "broken": list(each.broken[dc]),
                     }
                     for dc in dcs
@@ -137,7 +138,7 @@ def find_optimum(folder: Path, fingerprint: str, steps: int) -> tuple[Path, dict
 
 
 def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
-    """What the figures of an optimum are, and what does not hold, in words.
+    """Explanations of the figures of an optimum, and checks that failed, in words.
 
     Args:
         content: content of optimum.json.
@@ -157,30 +158,32 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
     for each in content["controllers"]:
         remarks += [
             f"{dc['name']}: {each['controller']} {text}, which the achieved path does not"
-            for dc, own in zip(dcs, each["data_centers"], strict=True)
-            for text in own["broken"]
+            for dc, reached in zip(dcs, each["data_centers"], strict=True)
+            for text in reached["broken"]
         ]
         remarks += [
-            f"{dc['name']}: {each['controller']} reaches {100.0 * own['share']:.2f} % of the "
+            f"{dc['name']}: {each['controller']} reaches {100.0 * reached['share']:.2f} % of the "
             "achievable, more than the achieved path: the best is between it and the bound"
-            for dc, own in zip(dcs, each["data_centers"], strict=True)
-            if own["share"] is not None and own["share"] > _ALL_OF_IT and not own["broken"]
+            for dc, reached in zip(dcs, each["data_centers"], strict=True)
+            if reached["share"] is not None
+            and reached["share"] > _ALL_OF_IT
+            and not reached["broken"]
         ]
     return remarks
 
 
 def remarks_beside(metrics: Mapping[str, Any]) -> list[str]:
-    """What is to be known of the share of a run, in words: bounds that are none, limits it breaks.
+    """Reservations about the share of a run, in words: bounds that are none, limits that it breaks.
 
     Args:
         metrics: content of metrics.json of a run beside an optimum.
     """
-    names, own = [dc["name"] for dc in metrics["data_centers"]], metrics["optimum"]
-    kinds = zip(names, own["bound_kinds"], strict=True)
+    names, beside = [dc["name"] for dc in metrics["data_centers"]], metrics["optimum"]
+    kinds = zip(names, beside["bound_kinds"], strict=True)
     remarks = [f"{name}: {kind}" for name, kind in kinds if kind != _BOUND]
     return remarks + [
         f"{name}: this run {text}, which the achieved path does not"
-        for name, texts in zip(names, own["broken"], strict=True)
+        for name, texts in zip(names, beside["broken"], strict=True)
         for text in texts
     ]
 
@@ -197,7 +200,7 @@ def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
         **figures,
         "bound_kind": optimum.bound_kinds[dc],
         "inlet_limit_c": limit_c if math.isfinite(limit_c) else None,
-        "certificates": {k: _or_none(v) for k, v in optimum.certificates[dc].items()},
+        "certificates": {k: finite_or_none(v) for k, v in optimum.certificates[dc].items()},
         "failures": list(optimum.failures[dc]),
     }
 
@@ -207,15 +210,10 @@ def _figures(figures: Mapping[str, float], alone: Mapping[str, float]) -> dict[s
     idle, bound, achieved = (figures[name] for name in _FIGURES)
     gap = 100.0 * (achieved - bound) / idle if idle else math.nan
     return {
-        **{name: _or_none(value) for name, value in figures.items()},
-        "gap_points": _or_none(gap),
-        "alone": {name: _or_none(value) for name, value in alone.items()},
+        **{name: finite_or_none(value) for name, value in figures.items()},
+        "gap_points": finite_or_none(gap),
+        "alone": {name: finite_or_none(value) for name, value in alone.items()},
     }
-
-
-def _or_none(value: float) -> float | None:
-    """A number for JSON, which has no nan."""
-    return float(value) if math.isfinite(value) else None
 
 
 def _read(path: Path) -> dict[str, Any]:

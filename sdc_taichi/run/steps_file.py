@@ -24,14 +24,14 @@ STEPS_FILE = "steps.parquet"
 METADATA_KEY = b"sdc_taichi"
 """Key of the file's metadata under which the run is described, as JSON."""
 RACKS_KEY = b"sdc_taichi_racks"
-"""Key of the file's metadata under which it is told how hot each rack became, as JSON.
+"""Key of the file's metadata for how hot each rack became, as JSON.
 
 A list with an object for each data center: ``hottest_steps``, the number of steps in which the
 hottest inlet of each rack was that of the hall, up to ``TIE_K``, and ``inlet_max_c``, the highest
 inlet of each rack over the run, in C.
 """
 AIR_KEY = b"sdc_taichi_air"
-"""Key of the file's metadata under which the air before the racks is told, as JSON: a list with
+"""Key of the file's metadata for the air before the racks, as JSON: a list with
 what ``air_values`` says of each data center in its hottest step. Empty for runs of more
 than ``MOST_AIR_RACKS`` racks."""
 MOST_AIR_RACKS = 20_000
@@ -100,8 +100,8 @@ class StepsWriter:
             SdcError: the file cannot be written.
         """
         self._write_row_group()
-        found = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
-        texts = {key: json.dumps(value, allow_nan=False) for key, value in found.items()}
+        tables = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
+        texts = {key: json.dumps(value, allow_nan=False) for key, value in tables.items()}
         with naming_errors(self._output.path):
             self._writer.add_key_value_metadata({k: text.encode() for k, text in texts.items()})
             self._writer.close()
@@ -117,8 +117,8 @@ class StepsWriter:
         """What ``AIR_KEY`` says, of the steps added."""
         if self._air is None:
             return []
-        found = map(self._air.of, range(self._fleet.size))
-        return [air_values(each) for each in found if each is not None]
+        of_dcs = map(self._air.of, range(self._fleet.size))
+        return [air_values(each) for each in of_dcs if each is not None]
 
     def _write_row_group(self) -> None:
         """Write the steps added since the last row group, if there are any."""
@@ -242,12 +242,12 @@ class HottestAir:
         return AirAtStep(int(self._step[dc]), intake_air_of(self._sim.fleet, self._air, dc))
 
 
-def air_values(found: AirAtStep) -> dict[str, Any]:
+def air_values(hottest: AirAtStep) -> dict[str, Any]:
     """Air as plain values for JSON: ``step``, and a list by rack or CRAC unit for each field."""
     lists = {
-        name: values.round(_DECIMALS).tolist() for name, values in fields_of(found.air).items()
+        name: values.round(_DECIMALS).tolist() for name, values in fields_of(hottest.air).items()
     }
-    return {"step": found.step, **lists}
+    return {"step": hottest.step, **lists}
 
 
 def air_from_values(values: dict[str, Any], *, racks: int, units: int, steps: int) -> AirAtStep:

@@ -33,8 +33,8 @@ def with_prices(drivers: Drivers, configs: Sequence[DataCenterConfig]) -> Driver
                 of_tariff[tariff] = np.repeat(tariff.hourly_prices(), per_hour)
             known[id(tariff)] = of_tariff[tariff]
     prices = [known[id(config.tariff)] for config in configs]
-    found = _beside(drivers.outdoor_c, prices)
-    return replace(drivers, price_per_kwh=fleet_series(prices) if found is None else found)
+    beside = _beside(drivers.outdoor_c, prices)
+    return replace(drivers, price_per_kwh=fleet_series(prices) if beside is None else beside)
 
 
 def _beside(series: FleetSeries, prices: Sequence[F64]) -> FleetSeries | None:

@@ -188,19 +188,24 @@ class CracUnits:
 
 
 def schedules_c(fleet: Fleet) -> FleetSeries | None:
-    """Scheduled setpoints over the steps of a year, in C, nan without; None if nobody has any."""
+    """Scheduled setpoints over the steps of a year, in C; nan without a schedule.
+
+    None if no data center has one.
+    """
     hourly_c: dict[SetpointConfig, F64] = {}
     none_c = np.array([np.nan])
     for setpoint in (config.hvac.setpoint for config in fleet.configs):
         if setpoint not in hourly_c:
-            found = setpoint.hourly_c()
-            hourly_c[setpoint] = none_c if found is None else np.repeat(found, fleet.steps_per_hour)
+            of_day_c = setpoint.hourly_c()
+            hourly_c[setpoint] = (
+                none_c if of_day_c is None else np.repeat(of_day_c, fleet.steps_per_hour)
+            )
     schedules = [hourly_c[config.hvac.setpoint] for config in fleet.configs]
     return None if all(x is none_c for x in schedules) else fleet_series(schedules)
 
 
-_MOST_KEPT = 4096
-"""Most sets of running units whose weights are kept."""
+_MOST_STORED = 4096
+"""Most sets of running units whose weights are stored."""
 
 
 class SharedPlenum:
@@ -231,7 +236,7 @@ class SharedPlenum:
         """Weight of each CRAC unit in the shares of all racks, (U,); 1 where all units run."""
         self._whole = np.ones(fleet.units)
         self._running = self._whole
-        self._kept: dict[tuple[int, bytes], F64] = {}
+        self._weights_of_set: dict[tuple[int, bytes], F64] = {}
 
     def supply_from(self, running: F64 | None) -> None:
         """Make the shares those of the units that run: 1 runs, 0 is down, (U,); None is all."""
@@ -250,17 +255,17 @@ class SharedPlenum:
         assert fleet.air is not None
         units = slice(*fleet.unit_offsets[dc : dc + 2])
         at = slice(*fleet.air.unit_share_offsets[dc : dc + 2])
-        own = running[units]
-        shares = fleet.air.unit_shares[at].reshape(-1, len(own))
-        key = int(fleet.air.steady_state_of_dc[dc]), own.tobytes()
-        if key not in self._kept:
-            if len(self._kept) == _MOST_KEPT:
-                self._kept.clear()
-            self._kept[key] = self._weights(dc, shares, own)
-        self.weight[units] = self._kept[key]
-        some_down = bool(np.any(own > 0) and np.any(own == 0))
+        runs = running[units]
+        shares = fleet.air.unit_shares[at].reshape(-1, len(runs))
+        key = int(fleet.air.steady_state_of_dc[dc]), runs.tobytes()
+        if key not in self._weights_of_set:
+            if len(self._weights_of_set) == _MOST_STORED:
+                self._weights_of_set.clear()
+            self._weights_of_set[key] = self._weights(dc, shares, runs)
+        self.weight[units] = self._weights_of_set[key]
+        some_down = bool(np.any(runs > 0) and np.any(runs == 0))
         self._adjusts_supply[dc] = some_down or self._always_adjusts[dc]
-        by_block = shares_by_block(weighted_shares(shares, self._kept[key]), self._lanes)
+        by_block = shares_by_block(weighted_shares(shares, self._weights_of_set[key]), self._lanes)
         first = int(self._first_share[dc])
         self._kernel_shares[first : first + len(by_block)] = by_block
 

@@ -170,17 +170,17 @@ def _spectral_radius_bounds(weights: MixWeights, share: F64) -> tuple[float, flo
     return low, high
 
 
-def design_hall_values(found: DesignHall) -> dict[str, Any]:
+def design_hall_values(solved: DesignHall) -> dict[str, Any]:
     """A hall at its design point as plain values for JSON.
 
     Units are in the keys; lists per rack are in the order of the racks, row by row.
     """
-    hall, air = found.config.hall, found.air
+    hall, air = solved.config.hall, solved.air
     flows: dict[str, Any] = {}
     if air is not None:
         flows = {
             "return_c": air.return_c,
-            "return_approach_mean_k": air.return_c - float(found.outlet_c.mean()),
+            "return_approach_mean_k": air.return_c - float(solved.outlet_c.mean()),
             "bypass_share": air.bypass_share,
             "shi": air.shi,
             "rhi": 1.0 - air.shi,
@@ -189,31 +189,31 @@ def design_hall_values(found: DesignHall) -> dict[str, Any]:
             "exhaust_share": air.exhaust_share.tolist(),
         }
     return {
-        "name": found.config.name,
+        "name": solved.config.name,
         "inlet_model": hall.inlet_model,
         "rows": hall.rows,
         "racks_per_row": hall.racks_per_row,
-        "servers": found.servers,
-        "length_m": found.plan.length_m,
-        "width_m": found.plan.width_m,
-        "air_m3": found.plan.air_m3,
+        "servers": solved.servers,
+        "length_m": solved.plan.length_m,
+        "width_m": solved.plan.width_m,
+        "air_m3": solved.plan.air_m3,
         "layout": hall.layout.model_dump(mode="json"),
         "crac_units": [
             {"x_m": float(x), "y_m": float(y), "airflow_m3s": float(flow)}
-            for (x, y), flow in zip(found.unit_places_m, found.unit_m3s, strict=True)
+            for (x, y), flow in zip(solved.unit_places_m, solved.unit_m3s, strict=True)
         ],
-        "supply_c": found.supply_c,
-        "it_w": float(found.it_w.sum()),
-        "crac_flow_m3s": found.design_flow_m3s,
-        "hottest_rack": found.hottest_rack,
-        "hottest_server": found.hottest_server,
-        "hottest_inlet_c": float(found.inlet_max_c.max()),
+        "supply_c": solved.supply_c,
+        "it_w": float(solved.it_w.sum()),
+        "crac_flow_m3s": solved.design_flow_m3s,
+        "hottest_rack": solved.hottest_rack,
+        "hottest_server": solved.hottest_server,
+        "hottest_inlet_c": float(solved.inlet_max_c.max()),
         **flows,
         **({"rack_types": list(types)} if (types := hall.rack_type_names()) else {}),
-        "rack_it_w": found.it_w.tolist(),
-        "rack_airflow_m3s": found.airflow_m3s.tolist(),
-        "approach_k": found.approach_k.tolist(),
-        "inlet_c": found.inlet_c.tolist(),
-        "inlet_max_c": found.inlet_max_c.tolist(),
-        "outlet_c": found.outlet_c.tolist(),
+        "rack_it_w": solved.it_w.tolist(),
+        "rack_airflow_m3s": solved.airflow_m3s.tolist(),
+        "approach_k": solved.approach_k.tolist(),
+        "inlet_c": solved.inlet_c.tolist(),
+        "inlet_max_c": solved.inlet_max_c.tolist(),
+        "outlet_c": solved.outlet_c.tolist(),
     }

@@ -76,8 +76,8 @@ class FleetSeries:
         Series that share both arrays are read at places that are computed once.
         """
         offsets, lengths = (
-            theirs if np.array_equal(own, theirs) else own
-            for own, theirs in ((self.offsets, other.offsets), (self.lengths, other.lengths))
+            theirs if np.array_equal(mine, theirs) else mine
+            for mine, theirs in ((self.offsets, other.offsets), (self.lengths, other.lengths))
         )
         return FleetSeries(self.values, offsets, lengths)
 
@@ -170,8 +170,8 @@ class Drivers:
         round apart.
         """
         sha = hashlib.sha256()
-        given = (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand)
-        for series in (*given, *(() if self.price_per_kwh is None else (self.price_per_kwh,))):
+        all_series = (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand)
+        for series in (*all_series, *(() if self.price_per_kwh is None else (self.price_per_kwh,))):
             sha.update(common_digits(series.values))
             for array in (series.offsets, series.lengths):
                 sha.update(array.tobytes())
@@ -381,7 +381,7 @@ def drivers_from_arrays(
     size: int = 1,
     source: str = "arrays",
 ) -> Drivers:
-    """Inputs given as arrays at the simulation's time step; the first value is that of step 0.
+    """Inputs as arrays at the simulation's time step; the first value is that of step 0.
 
     Args:
         outdoor_c: dry bulb, -90..60 C, (T,) for all data centers or (B, T).
@@ -394,14 +394,14 @@ def drivers_from_arrays(
     Raises:
         DataError: shapes that differ, or values that are not finite or out of range.
     """
-    given = {
+    arrays = {
         "outdoor_c": outdoor_c,
         "wet_bulb_c": wet_bulb_c,
         "ci_g_per_kwh": ci_g_per_kwh,
         "demand": demand,
     }
     rows = {
-        name: np.atleast_2d(np.asarray(value, dtype=np.float64)) for name, value in given.items()
+        name: np.atleast_2d(np.asarray(value, dtype=np.float64)) for name, value in arrays.items()
     }
     size = max([size, *(len(v) for v in rows.values())])
     shape = (size, rows["outdoor_c"].shape[1])
@@ -508,10 +508,10 @@ def _site_is_synthetic(site: SiteData) -> bool:
     return site.outdoor_c.synthetic or site.ci_g_per_kwh.synthetic
 
 
-def _size_bytes(found: SiteData | Series) -> int:
-    if isinstance(found, Series):
-        return found.values.nbytes
-    return sum(_size_bytes(x) for x in (found.outdoor_c, found.wet_bulb_c, found.ci_g_per_kwh))
+def _size_bytes(stored: SiteData | Series) -> int:
+    if isinstance(stored, Series):
+        return stored.values.nbytes
+    return sum(_size_bytes(x) for x in (stored.outdoor_c, stored.wet_bulb_c, stored.ci_g_per_kwh))
 
 
 def _notes(site: SiteData, trace: Series) -> tuple[str, ...]:

@@ -179,15 +179,15 @@ class Timeline:
 
     def at(self, step: int) -> Disturbance:
         """Effects of events on step ``step`` after reset; a shared object while there are none."""
-        found = self._covering(step)
-        if not len(found.kind):
+        events = self._covering(step)
+        if not len(events.kind):
             return self._normal
         normal = self._normal
         unit_up, grid_up = normal.unit_up.copy(), normal.grid_up.copy()
         airflow = normal.rack_airflow.copy()
         offset_k = normal.outdoor_offset_k.copy()
-        is_kind = {kind: found.kind == code for code, kind in enumerate(_KINDS)}
-        down = found.where(is_kind["crac_down"])
+        is_kind = {kind: events.kind == code for code, kind in enumerate(_KINDS)}
+        down = events.where(is_kind["crac_down"])
         one = down.target != _NO_TARGET
         unit_up[self._unit_offsets[down.dc[one]] + down.target[one]] = False
         without = np.zeros(len(grid_up), dtype=np.bool_)
@@ -196,17 +196,17 @@ class Timeline:
         shares = {}
         for name, kinds in _PLANT_SHARES.items():
             shares[name] = getattr(normal, name).copy()
-            left = found.where(np.logical_or.reduce([is_kind[kind] for kind in kinds]))
+            left = events.where(np.logical_or.reduce([is_kind[kind] for kind in kinds]))
             np.multiply.at(shares[name], left.dc, left.value)
-        failed = found.where(is_kind["rack_fan_failure"])
+        failed = events.where(is_kind["rack_fan_failure"])
         np.multiply.at(airflow, self._rack_offsets[failed.dc] + failed.target, failed.value)
-        wave = found.where(is_kind["heat_wave"])
+        wave = events.where(is_kind["heat_wave"])
         np.add.at(offset_k, wave.dc, wave.value)
-        grid_up[found.dc[is_kind["grid_outage"]]] = False
+        grid_up[events.dc[is_kind["grid_outage"]]] = False
         return _read_only(
             Disturbance(
                 active=True,
-                active_events=np.bincount(found.dc, minlength=len(grid_up)).astype(np.float64),
+                active_events=np.bincount(events.dc, minlength=len(grid_up)).astype(np.float64),
                 unit_up=unit_up,
                 **shares,
                 rack_airflow=airflow,
@@ -217,20 +217,20 @@ class Timeline:
 
     def active(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step``, by data center and start."""
-        found = self._covering(step)
+        events = self._covering(step)
         out = []
-        for i in np.lexsort((found.first_step, found.dc)):
-            kind, value = _KINDS[found.kind[i]], float(found.value[i])
-            target = int(found.target[i])
+        for i in np.lexsort((events.first_step, events.dc)):
+            kind, value = _KINDS[events.kind[i]], float(events.value[i])
+            target = int(events.target[i])
             out.append(
                 ActiveEvent(
                     kind=kind,
-                    dc=int(found.dc[i]),
+                    dc=int(events.dc[i]),
                     target=None if target == _NO_TARGET else target,
                     share=value if kind in _KINDS_WITH_SHARE else None,
                     offset_k=value if kind == "heat_wave" else None,
-                    start_step=int(found.first_step[i]),
-                    end_step=int(found.end_step[i]),
+                    start_step=int(events.first_step[i]),
+                    end_step=int(events.end_step[i]),
                 )
             )
         return out
@@ -288,7 +288,7 @@ def schedule(
     """Events of a fleet.
 
     Sampled events are a Poisson process per rule, with durations, units and racks drawn evenly.
-    Each rule of each data center draws from a stream of its own, told by seed, name and rule, so a
+    Each rule of each data center draws from its own random stream, by seed, name and rule, so a
     data center meets the same events alone and in a fleet. None started before step 0. Where events
     overlap, shares multiply, offsets add, and a unit is down as long as any of them has it down.
 

@@ -157,9 +157,9 @@ class Facility:
         water = self._use_water(inputs, air, plant)
         energy = self._energy(inputs, it_w, self._hvac_w(air, plant))
         indices = self._air_indices(inputs.air, air.return_c)
-        found = joined(*map(fields_of, (air, plant, heat, water, indices)), energy)
+        results = joined(*map(fields_of, (air, plant, heat, water, indices)), energy)
         # The plant's flows of water and air are no results.
-        return {name: values for name, values in found.items() if name in QUANTITIES}
+        return {name: values for name, values in results.items() if name in QUANTITIES}
 
     def powered_share(self, grid_up: npt.NDArray[np.bool_], stored_kwh: F64) -> F64:
         """Share of a step with power, 0..1, (B,).
@@ -427,8 +427,8 @@ class FacilityStage:
 
     def removable_w(self, surroundings: Surroundings, supply: Supply) -> F64:
         """Heat that the plant can take during a step, W, (B,)."""
-        found = self._removable(surroundings=surroundings, supply=supply)
-        return found["heat_removed_w"]
+        results = self._removable(surroundings=surroundings, supply=supply)
+        return results["heat_removed_w"]
 
     def step(
         self,
@@ -444,18 +444,18 @@ class FacilityStage:
             Quantities by the names of ``StepResult``, and ``within_limits``, which is 1 for data
             centers whose results are physical, else 0, (B,).
         """
-        found = self._step(
+        results = self._step(
             state=state, commands=commands, surroundings=surroundings, supply=supply, air=air
         )
-        found["unit_flow_m3s"] = (
-            air.unit_airflow_m3s if self._recirculates else found["crac_flow_m3s"]
+        results["unit_flow_m3s"] = (
+            air.unit_airflow_m3s if self._recirculates else results["crac_flow_m3s"]
         )
-        return found
+        return results
 
 
 def _checked_step(facility: Facility, **stages: Any) -> dict[str, F64]:
     """Results of a facility, and whether they and what they follow from are physical."""
-    found = facility.step(StepInputs(**stages))
+    results = facility.step(StepInputs(**stages))
     air, surroundings = stages["air"], stages["surroundings"]
     checked = {
         "outdoor_c": surroundings.outdoor_c,
@@ -464,4 +464,4 @@ def _checked_step(facility: Facility, **stages: Any) -> dict[str, F64]:
         "inlet_max_c": air.inlet_max_c,
         "outlet_mean_c": air.outlet_mean_c,
     }
-    return joined(found, {"within_limits": within_limits(joined(found, checked))})
+    return joined(results, {"within_limits": within_limits(joined(results, checked))})

@@ -347,14 +347,14 @@ def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
     """Value of a config field that all data centers of a fleet share."""
-    found = [*map(attrgetter(path), configs)]
-    for config, value in zip(configs, found, strict=True):
-        if value != found[0]:
+    values = [*map(attrgetter(path), configs)]
+    for config, value in zip(configs, values, strict=True):
+        if value != values[0]:
             raise ConfigError(
-                f"fleet: {path} is {found[0]!r} in {configs[0].name} and {value!r} in "
+                f"fleet: {path} is {values[0]!r} in {configs[0].name} and {value!r} in "
                 f"{config.name}; it must be the same in all data centers of a fleet"
             )
-    return found[0]
+    return values[0]
 
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
@@ -367,17 +367,17 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         )
     air, approach_k, fresh_share = None, hall.rack_approach_k(), 1.0
     if hall.inlet_model == "recirculation":
-        found = calibrate(config, servers)
-        design, fresh_share = found.design, found.fresh_share
+        recirculation = calibrate(config, servers)
+        design, fresh_share = recirculation.design, recirculation.fresh_share
         approach_k = design.approach_k
-        shares, unit_design_m3s = _unit_supply(config, found)
-        of_groups = servers.per_rack(found.group_exhaust_share)
+        shares, unit_design_m3s = _unit_supply(config, recirculation)
+        of_groups = servers.per_rack(recirculation.group_exhaust_share)
         air = _Air(
-            mix_weights=found.mix_weights,
+            mix_weights=recirculation.mix_weights,
             exhaust_share=of_groups / servers.per_rack(servers.height_factor),
             unit_shares=shares,
-            rack_need_m3s=found.need_m3s,
-            steady_states=initial_guess(config, servers, found),
+            rack_need_m3s=recirculation.need_m3s,
+            steady_states=initial_guess(config, servers, recirculation),
         )
     else:
         design = design_point(config, servers)
@@ -418,7 +418,7 @@ def _capacity_w(config: DataCenterConfig) -> F64:
     return np.broadcast_to(np.asarray(given_w, np.float64), (crac.units,))
 
 
-def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F64]:
+def _unit_supply(config: DataCenterConfig, recirculation: Recirculation) -> tuple[F64, F64]:
     """Shares of the CRAC units in the supply of the racks, (R, U), and airflows, in m3/s, (U,)."""
     crac, racks = config.hvac.crac, config.hall.racks
     if racks * crac.units > MOST_UNIT_SHARES:
@@ -429,22 +429,26 @@ def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F
         )
     if crac.unit_shares is not None:
         shares = np.array(crac.unit_shares)
-        return shares, full_airflow_m3s(crac, shares.T @ found.need_m3s, found.design.crac_flow_m3s)
+        return shares, full_airflow_m3s(
+            crac, shares.T @ recirculation.need_m3s, recirculation.design.crac_flow_m3s
+        )
     shares = unit_shares(floor_plan(config.hall), crac.units, crac.supply_length_m)
-    airflow_m3s = full_airflow_m3s(crac, shares.T @ found.need_m3s, found.design.crac_flow_m3s)
+    airflow_m3s = full_airflow_m3s(
+        crac, shares.T @ recirculation.need_m3s, recirculation.design.crac_flow_m3s
+    )
     if crac.airflow_m3s is not None:
         # Large units reach further than small ones.
-        weight = unit_weights(shares, found.need_m3s, airflow_m3s)
+        weight = unit_weights(shares, recirculation.need_m3s, airflow_m3s)
         shares = weighted_shares(shares, weight)
     return shares, airflow_m3s
 
 
 def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers) -> F64:
     """Heat capacity of one server of each group, in J/K, (G,)."""
-    given = config.servers.heat_capacity_kj_per_k
-    if given is None:
+    kj_per_k = config.servers.heat_capacity_kj_per_k
+    if kj_per_k is None:
         return SERVER_J_PER_K_W * servers.full_w
-    return np.full(len(servers.full_w), 1e3 * given)
+    return np.full(len(servers.full_w), 1e3 * kj_per_k)
 
 
 def _group_inputs(servers: RackServers, full_airflow: F64) -> dict[str, F64]:
@@ -460,17 +464,17 @@ def _group_inputs(servers: RackServers, full_airflow: F64) -> dict[str, F64]:
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
     """Recirculation of all halls end to end; copies of a hall share weights and steady states."""
-    found = [h.air for h in halls if h.air is not None]
-    distinct = list({id(air): air for air in found}.values())
+    airs = [h.air for h in halls if h.air is not None]
+    distinct = list({id(air): air for air in airs}.values())
     entry_of = {id(air): i for i, air in enumerate(distinct)}
-    entry = np.array([entry_of[id(air)] for air in found], dtype=np.int32)
+    entry = np.array([entry_of[id(air)] for air in airs], dtype=np.int32)
     return HallAir(
         mix_weights=_joined([air.mix_weights for air in distinct], entry),
-        exhaust_share=np.concatenate([air.exhaust_share for air in found]),
-        unit_shares=np.concatenate([air.unit_shares.reshape(-1) for air in found]),
-        rack_need_m3s=np.concatenate([air.rack_need_m3s for air in found]),
+        exhaust_share=np.concatenate([air.exhaust_share for air in airs]),
+        unit_shares=np.concatenate([air.unit_shares.reshape(-1) for air in airs]),
+        rack_need_m3s=np.concatenate([air.rack_need_m3s for air in airs]),
         unit_share_offsets=offsets_from_counts(
-            [air.unit_shares.size for air in found], "unit shares"
+            [air.unit_shares.size for air in airs], "unit shares"
         ),
         steady_states=tuple(air.steady_states for air in distinct),
         steady_state_of_dc=entry,
@@ -518,7 +522,7 @@ def offsets_from_counts(counts: npt.ArrayLike, what: str) -> I32:
     Raises:
         ConfigError: naming ``what`` when there are more than the kernels can index.
     """
-    found = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    if found[-1] > MOST_ENTRIES:
-        raise ConfigError(f"fleet: {found[-1]:,} {what}; valid is at most {MOST_ENTRIES:,}")
-    return found.astype(np.int32)
+    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    if offsets[-1] > MOST_ENTRIES:
+        raise ConfigError(f"fleet: {offsets[-1]:,} {what}; valid is at most {MOST_ENTRIES:,}")
+    return offsets.astype(np.int32)

@@ -83,13 +83,13 @@ def locations(configs: Sequence[DataCenterConfig]) -> list[str]:
     A weather file without a city, or one that cannot be read, is named by its stem.
     """
     cities: dict[str, str] = {}
-    found = []
+    places = []
     for config in configs:
         file = config.site.weather_file
         if file is not None and file not in cities:
             cities[file] = _city(file)
-        found.append(config.site.location if file is None else cities[file])
-    return found
+        places.append(config.site.location if file is None else cities[file])
+    return places
 
 
 def place_names(configs: Sequence[DataCenterConfig]) -> list[str]:

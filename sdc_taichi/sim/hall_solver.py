@@ -212,17 +212,17 @@ class Hall:
         """Sweeps, or substeps, that each data center took in the last step, (B,)."""
         return np.array(self._control["sweep"])
 
-    def solve(self, met: Conditions) -> HallSums:
+    def solve(self, conditions: Conditions) -> HallSums:
         """Quasi-steady temperatures and power.
 
         Args:
-            met: supply air, load and what is out of order.
+            conditions: supply air, load and what is out of order.
 
         Raises:
             PhysicalLimitError: no steady state, as when no unit moves air.
             SdcError: conditions that are not finite.
         """
-        self._set_conditions(met)
+        self._set_conditions(conditions)
         self._unit_state["fresh_ratio"][:] = 1.0
         self._dc["fan_speed"][:] = 1.0
         self._begin_step(exchanges_before=0)
@@ -237,12 +237,12 @@ class Hall:
         return self._results(dc_out, transient=False)
 
     def advance(
-        self, met: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
+        self, conditions: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
     ) -> tuple[HallSums, HallState]:
         """One step of transient halls, in equal substeps of at most ``substep_s``.
 
         Args:
-            met: load and what is out of order; supply air follows from the coil.
+            conditions: load and what is out of order; supply air follows from the coil.
             state: memory at the start of the step.
             coil: setpoints, heat held by the room and what the plant can take.
             step_s: length of the step.
@@ -251,7 +251,7 @@ class Hall:
         Returns:
             Means over the step, and the memory at its end.
         """
-        self._set_conditions(met)
+        self._set_conditions(conditions)
         self._set_state(state)
         self._set_coil(coil, state.supply_excess_k)
         substeps = int(np.ceil(step_s / substep_s - 1e-9))
@@ -270,9 +270,9 @@ class Hall:
         )
         return self._results(dc_out, transient=True), self._hall_state(after)
 
-    def steady_state(self, met: Conditions) -> HallState:
+    def steady_state(self, conditions: Conditions) -> HallState:
         """State of transient halls that have been in the given conditions for ever."""
-        self.solve(met)
+        self.solve(conditions)
         for name, value in (("room_j", 0.0), ("room_j_per_k", 1.0), ("coil_limit_w", 0.0)):
             self._dc[name][:] = value
         server_c = np.zeros(self._fleet.groups, self._dtype)
@@ -346,9 +346,9 @@ class Hall:
         if self._group_layers is None:
             layers = [self._aligned((self._fleet.groups,)) for _ in range(3)]
             self._group_layers = ServerLayers(*layers), self._layer_arguments(layers)
-        found, arguments = self._group_layers
+        layers_of_groups, arguments = self._group_layers
         self._call_layers_kernel(arguments, per_group=1)
-        return found
+        return layers_of_groups
 
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, in C, (G,).
@@ -373,26 +373,29 @@ class Hall:
             raise RuntimeStateError("no step has been done yet; air and servers exist after one")
         return self._was_transient
 
-    def _set_conditions(self, met: Conditions) -> None:
+    def _set_conditions(self, conditions: Conditions) -> None:
         """Check conditions and write them to the inputs of the kernels."""
         for name, shape in self._shapes.items():
-            given = getattr(met, name)
-            if given is None:
+            values = getattr(conditions, name)
+            if values is None:
                 continue
-            if np.shape(given) != shape:
-                raise SdcError(f"conditions: {name} has shape {np.shape(given)}; valid is {shape}")
-            if not isfinite(np.add.reduce(given)):
+            if np.shape(values) != shape:
+                raise SdcError(f"conditions: {name} has shape {np.shape(values)}; valid is {shape}")
+            if not isfinite(np.add.reduce(values)):
                 raise SdcError(f"conditions: {name} is not finite; valid are finite numbers")
         self.discard_last_step()
         self._load_level, self._group_load = LOADS_PER_DC, self._none
-        self._dc["utilisation"][:] = met.utilisation
-        if met.group_load is not None:
+        self._dc["utilisation"][:] = conditions.utilisation
+        if conditions.group_load is not None:
             self._load_level = LOADS_PER_GROUP
-            self._group_load = np.array(met.group_load, dtype=self._dtype, order="C")
-        elif met.rack_load is not None:
+            self._group_load = np.array(conditions.group_load, dtype=self._dtype, order="C")
+        elif conditions.rack_load is not None:
             self._load_level = LOADS_PER_RACK
-            self._places.put(self._rack["load"], met.rack_load)
-        for name, values in (("powered", met.powered), ("fan_airflow", met.rack_airflow)):
+            self._places.put(self._rack["load"], conditions.rack_load)
+        for name, values in (
+            ("powered", conditions.powered),
+            ("fan_airflow", conditions.rack_airflow),
+        ):
             row = self._rack[name]
             if values is not None:
                 self._places.put(row, values)
@@ -400,13 +403,13 @@ class Hall:
             elif name in self._overridden_rows:
                 row[:] = self._is_rack
                 self._overridden_rows.remove(name)
-        self._tables.plenum.supply_from(met.unit_running)
+        self._tables.plenum.supply_from(conditions.unit_running)
         unit = self._unit
-        unit["low"][:] = 1.0 if met.unit_low is None else met.unit_low
-        unit["high"][:] = 1.0 if met.unit_high is None else met.unit_high
-        unit["running"][:] = 1.0 if met.unit_running is None else met.unit_running
-        unit["setpoint_c"][:] = met.unit_supply_c
-        self._unit_state["supply_c"][:] = met.unit_supply_c
+        unit["low"][:] = 1.0 if conditions.unit_low is None else conditions.unit_low
+        unit["high"][:] = 1.0 if conditions.unit_high is None else conditions.unit_high
+        unit["running"][:] = 1.0 if conditions.unit_running is None else conditions.unit_running
+        unit["setpoint_c"][:] = conditions.unit_supply_c
+        self._unit_state["supply_c"][:] = conditions.unit_supply_c
         self._unit_state["excess_k"][:] = 0.0
 
     def _set_state(self, state: HallState) -> None:
@@ -505,7 +508,7 @@ class Hall:
             **arguments,
         )
         if self._returns_buffers:
-            # Whoever has the results of the step has these, and no other needs them.
+            # The results of the step hold these arrays; the kernel needs them no more.
             self._layers_kernel.release("rack_out")
 
     def _layer_arguments(self, layers: list[Any]) -> dict[str, Any]:

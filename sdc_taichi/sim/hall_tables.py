@@ -288,7 +288,7 @@ def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -
     For a block of two racks with 2 and 3 groups, ``offsets`` is [0, 2, 5]. Entry 0 holds groups 0
     and 2 in its first two lanes, entry 1 groups 1 and 3, and entry 2 groups 1 and 4: the first rack
     has no third group and repeats its last one, with a count of 0. The other lanes repeat the
-    second, likewise with a count of 0.
+    second, also with a count of 0.
 
     Args:
         rows: rows GROUP_INPUTS of the groups of the hall.
@@ -351,8 +351,8 @@ def _build_air(
     ):
         n_places = int(places.blocks[dc]) * LANES
         at = air.unit_share_offsets[dc]
-        own = air.unit_shares[at : at + racks * units].reshape(racks, units)
-        shares.append(shares_by_block(own, LANES))
+        shares_of_hall = air.unit_shares[at : at + racks * units].reshape(racks, units)
+        shares.append(shares_by_block(shares_of_hall, LANES))
         # Sparse halls fill up to whole vectors of RUN_LANES with blocks of padding.
         shares.append(np.zeros((n_places // LANES * units - len(shares[-1]), LANES)))
         if racks > DENSE_RACKS:

@@ -116,9 +116,9 @@ HOTTEST_RACKS = 5
 LISTED_UNITS = 8
 """CRAC units that are described, those that give most."""
 LEAST_K = 0.005
-"""Least part of an inlet, of either sign, that is told in words, in K."""
+"""Least part of an inlet, of either sign, that is put into words, in K."""
 LEAST_SHARE = 0.0005
-"""Least share of a CRAC unit in the supply air of a rack that is told in words."""
+"""Least share of a CRAC unit in the supply air of a rack that is put into words."""
 _HEIGHT_ROW = list(GROUP_INPUTS).index("height_factor")
 _OFFSET_ROW = list(GROUP_INPUTS).index("inlet_offset_k")
 
@@ -252,10 +252,10 @@ class Inlets:
         group_0 = fleet.group_offsets[self._first_rack]
         ends = fleet.server_offsets[group_0 + np.array([first, group, end])]
         shares = self._shares[rack]
-        given = shares * air.fresh_ratio
-        cover = float(given.sum())
+        covered = shares * air.fresh_ratio
+        cover = float(covered.sum())
         # Where no unit gives anything, the supply air is what their shares would make it.
-        unit_share = given / cover if cover > 0.0 else shares
+        unit_share = covered / cover if cover > 0.0 else shares
         setpoint_c = float(unit_share @ air.setpoint_c)
         supply_c = float(unit_share @ air.supply_c)
         plain = InletParts(
@@ -329,8 +329,8 @@ class Inlets:
             first = self._first_rack
             rack_c = air.supply_c[0] + self._fleet.approach_k[first : first + self._racks]
             return np.asarray(np.repeat(rack_c, counts) + self._group_rows[_OFFSET_ROW])
-        given = self._shares * air.fresh_ratio
-        fresh_k = given @ air.supply_c - given.sum(axis=1) * air.mixed_c
+        covered = self._shares * air.fresh_ratio
+        fresh_k = covered @ air.supply_c - covered.sum(axis=1) * air.mixed_c
         taken = np.repeat(self._exhaust_share, counts) * self._group_rows[_HEIGHT_ROW]
         mixed_c, fresh_k = np.repeat(air.mixed_c, counts), np.repeat(fresh_k, counts)
         return np.asarray(mixed_c + (1.0 - taken) * fresh_k)
@@ -356,10 +356,10 @@ def inlet_terms(parts: InletParts, racks_per_row: int) -> list[tuple[str, float]
         ("its own exhaust", parts.own_exhaust_k),
         ("room air that is warmer than the exhausts of the moment", parts.lag_k),
     ]
-    kept = [(text, k) for text, k in terms if abs(k) >= LEAST_K]
+    shown = [(text, k) for text, k in terms if abs(k) >= LEAST_K]
     first = "coldest supply air that its setpoint of return air admits"
     first = first if parts.controls_return else "setpoint of its supply air"
-    return [(first, parts.setpoint_c), *kept]
+    return [(first, parts.setpoint_c), *shown]
 
 
 def exhaust_terms(parts: InletParts) -> list[tuple[str, float]]:
@@ -376,8 +376,10 @@ def state_texts(parts: InletParts) -> list[str]:
     """Containment, CRAC units and fans of a rack, in words."""
     texts = []
     if parts.containment > 0:
-        kept = "" if parts.contained_k is None else f", which keeps out {parts.contained_k:.2f} K"
-        texts.append(f"containment closes {100 * parts.containment:g} % of the paths{kept}")
+        kept_out = (
+            "" if parts.contained_k is None else f", which keeps out {parts.contained_k:.2f} K"
+        )
+        texts.append(f"containment closes {100 * parts.containment:g} % of the paths{kept_out}")
     units = np.argsort(-parts.unit_share, kind="stable")[:LISTED_UNITS]
     texts += [
         f"CRAC unit {i} gives {100 * parts.unit_share[i]:.1f} % of its supply air, at "

@@ -1,8 +1,8 @@
-"""Limits that no result of a step leaves in any data center.
+"""Physical limits of the results of a step, and the errors of results beyond them.
 
-They are no design limits: beyond them a hall has burnt, or an input is meaningless in a way that
-the bounds of its field cannot show. A run ends there, since what follows would be
-numbers without a meaning.
+They are no design limits: beyond them a hall has burnt, or inputs contradict each other in a way
+that the bounds of single fields cannot show. A run ends there, since later numbers would mean
+nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ POWER_LIMITS_W = (-1e-3, 1e12)
 """Limits of powers, in W: none is negative but for rounding, and the world draws some 3e12 W of
 electricity."""
 ENERGY_LIMITS_KWH = (-1e-3, 1e12)
-"""Limits of energies of a step, in kWh, likewise."""
+"""Limits of energies of a step, in kWh: as for powers, over one hour."""
 LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("outdoor_c", "wet_bulb_c"), WEATHER_LIMITS_C),
     **dict.fromkeys(
@@ -61,7 +61,7 @@ def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitE
     """The error of a step with a result beyond its limits: names data center, quantity and step.
 
     Args:
-        inside: what ``within_limits`` has found, (B,).
+        inside: what ``within_limits`` returned, (B,).
         result: the result of the step.
         fleet: the data centers.
     """
@@ -70,15 +70,15 @@ def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitE
     beyond = [name for name, (low, high) in LIMITS.items() if not low <= values[name] <= high]
     if beyond:
         low, high = LIMITS[beyond[0]]
-        found = f"{beyond[0]} is {values[beyond[0]]:.6g}"
+        excess = f"{beyond[0]} is {values[beyond[0]]:.6g}"
     else:
         # A single rack may burn, which the means of its hall hide.
         (low, high), rack = AIR_LIMITS_C, int(np.argmax(result.rack_outlet_max_c))
         dc = int(fleet.rack_dc[rack])
         number = rack - fleet.rack_offsets[dc]
-        found = f"outlet of rack {number} is {result.rack_outlet_max_c[rack]:.6g} C"
+        excess = f"outlet of rack {number} is {result.rack_outlet_max_c[rack]:.6g} C"
     return PhysicalLimitError(
-        f"{fleet.names[dc]}: {found} in step {result.step}; physical is {low:g}..{high:g}. {_WHY}"
+        f"{fleet.names[dc]}: {excess} in step {result.step}; physical is {low:g}..{high:g}. {_WHY}"
     )
 
 

@@ -52,10 +52,10 @@ class Simulator:
         if precision not in ("f32", "f64"):
             raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
-        given = load_drivers(self.fleet.configs) if drivers is None else drivers
+        inputs = load_drivers(self.fleet.configs) if drivers is None else drivers
         # None once the simulator is closed.
-        self._drivers: Drivers | None = self._checked_drivers(given)
-        self._initial_start = given.start
+        self._drivers: Drivers | None = self._checked_drivers(inputs)
+        self._initial_start = inputs.start
         self.precision: Precision = precision
         self.step_h = 1.0 / self.fleet.steps_per_hour
         self._timeline = schedule(
@@ -94,7 +94,7 @@ class Simulator:
 
     @property
     def state(self) -> State:
-        """The present state.
+        """State before the next step.
 
         Raises:
             RuntimeStateError: before ``reset``, or after ``close``.
@@ -218,7 +218,7 @@ class Simulator:
         return self._started().hall.groups()
 
     def intake_air(self) -> IntakeAir:
-        """Air before the racks in the last step, of which ``Inlets`` tells why they are warm.
+        """Air before the racks in the last step, from which ``Inlets`` explains inlet temperatures.
 
         Raises:
             RuntimeStateError: Before the first step.
@@ -343,17 +343,17 @@ class Simulator:
             )
         return with_prices(drivers, self.fleet.configs)
 
-    def _seeds(self, given: int | Sequence[int] | I64) -> I64:
+    def _seeds(self, seed: int | Sequence[int] | I64) -> I64:
         """Seeds of the data centers, (B,)."""
-        listed: list[Any] = np.ravel(given).tolist() if np.ndim(given) else [given]
+        listed: list[Any] = np.ravel(seed).tolist() if np.ndim(seed) else [seed]
         whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
-        expected = self.size if np.ndim(given) else 1
+        expected = self.size if np.ndim(seed) else 1
         if len(listed) != expected or not whole or not all(0 <= x < 2**63 for x in listed):
             raise ConfigError(
-                f"seed {given!r}: valid is an integer of 0..2**63 - 1, or one for each of "
+                f"seed {seed!r}: valid is an integer of 0..2**63 - 1, or one for each of "
                 f"{self.size} data centers"
             )
-        if not np.ndim(given):
+        if not np.ndim(seed):
             return seeds_of_fleet(int(listed[0]), self.fleet.names)
         return np.array(listed, dtype=np.int64)
 

@@ -83,19 +83,19 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
     outdoor_c = fleet.values("hvac.sizing.design_outdoor_c")
     wet_bulb_c = fleet.values("hvac.sizing.design_wet_bulb_c")
     model = MODELS[fleet.models["sizing"]]
-    found = model(
+    sized = model(
         fleet,
         hall,
         np.where(np.isnan(outdoor_c), design_outdoor_c, outdoor_c),
         np.where(np.isnan(wet_bulb_c), design_wet_bulb_c, wet_bulb_c),
     )
-    _check_sizes(fleet, found)
-    return found
+    _check_sizes(fleet, sized)
+    return sized
 
 
-def _check_sizes(fleet: Fleet, found: Sizing) -> None:
+def _check_sizes(fleet: Fleet, sized: Sizing) -> None:
     """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
-    sizes = fields_of(found) | fields_of(found.water_side)
+    sizes = fields_of(sized) | fields_of(sized.water_side)
     for name, values in sizes.items():
         if name in ("water_side", "power_path", "machine") or name.endswith("_c"):
             continue
@@ -276,10 +276,10 @@ def mean_return_approach_k(fleet: Fleet) -> F64:
 
 def _machine(fleet: Fleet) -> ChillerParameters:
     """Parameters of the chillers; the COP is that of the model where the config gives none."""
-    given = {name: fleet.values(f"hvac.chiller.{name}") for name in ChillerParameters._fields}
+    configured = {name: fleet.values(f"hvac.chiller.{name}") for name in ChillerParameters._fields}
     usual = CHILLERS[fleet.models["chiller"]].reference_cop
-    cop = given.pop("reference_cop")
-    return ChillerParameters(reference_cop=np.where(np.isnan(cop), usual, cop), **given)
+    cop = configured.pop("reference_cop")
+    return ChillerParameters(reference_cop=np.where(np.isnan(cop), usual, cop), **configured)
 
 
 def _design_chiller(
@@ -478,8 +478,8 @@ def _sized_pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
 
 def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
     """Capacity of the battery, kWh, (B,): that of the config, or as sized."""
-    given = fleet.values("battery.capacity_kwh")
-    return np.where(np.isnan(given), sized_kwh, given)
+    configured_kwh = fleet.values("battery.capacity_kwh")
+    return np.where(np.isnan(configured_kwh), sized_kwh, configured_kwh)
 
 
 def _power_path(fleet: Fleet, it_w: F64) -> tuple[PowerPath, F64]:

@@ -101,12 +101,12 @@ def check_origin(values: Any, fingerprint: str) -> None:
             f"snapshot: missing {missing}, unknown {extra}; it is no state of this program"
         )
     for name, wanted in (("version", VERSION), ("fingerprint", fingerprint)):
-        found, model = as_array(f"snapshot: {name}", values[name]), np.asarray(wanted)
-        if found.shape != () or found.dtype != model.dtype:
-            raise SdcError(f"snapshot: {name} is {shortened(found.tolist())}, expected {wanted!r}")
-        if found != model and name == "version":
-            raise SdcError(f"snapshot: version {found}, expected {VERSION}")
-        if found != model:
+        stored, model = as_array(f"snapshot: {name}", values[name]), np.asarray(wanted)
+        if stored.shape != () or stored.dtype != model.dtype:
+            raise SdcError(f"snapshot: {name} is {shortened(stored.tolist())}, expected {wanted!r}")
+        if stored != model and name == "version":
+            raise SdcError(f"snapshot: version {stored}, expected {VERSION}")
+        if stored != model:
             raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
 
 

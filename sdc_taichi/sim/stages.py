@@ -155,13 +155,13 @@ class SteadyFacility:
         precision: Precision,
     ) -> None:
         with warnings.catch_warnings():
-            # Whoever made the originals has been told.
+            # The originals have given these warnings.
             warnings.simplefilter("ignore", OddInputWarning)
             fleet = build_fleet(_copies(configs, of, setpoint_c))
         self._step_h = 1.0 / fleet.steps_per_hour
         # Weather is given step by step, and neither intensity nor price reaches the facility.
         still = FleetSeries(np.zeros(1), np.zeros_like(of), np.ones_like(of))
-        own = replace(
+        inputs = replace(
             drivers,
             outdoor_c=still,
             wet_bulb_c=still,
@@ -175,8 +175,8 @@ class SteadyFacility:
             notes=(),
             price_per_kwh=still,
         )
-        self._stages = stages = make_stages(fleet, own, precision, event_free=True)
-        self._state = stages.initial_state(fleet, np.zeros_like(of), own)
+        self._stages = stages = make_stages(fleet, inputs, precision, event_free=True)
+        self._state = stages.initial_state(fleet, np.zeros_like(of), inputs)
         self._commands = stages.decoder.decode(None)
         timeline = schedule(
             fleet.configs,
@@ -186,7 +186,7 @@ class SteadyFacility:
             seed=0,
         )
         self._surroundings = stages.surroundings.at(
-            own.at(0), timeline.at(0), self._state.stored_kwh
+            inputs.at(0), timeline.at(0), self._state.stored_kwh
         )
         self._supply = stages.crac_units.initial_supply()
         self._air = self._solve_air()
@@ -205,14 +205,14 @@ class SteadyFacility:
             wet_bulb_c: Wet-bulb temperature outside, in C, (B,).
         """
         self._surroundings.outdoor_c, self._surroundings.wet_bulb_c = outdoor_c, wet_bulb_c
-        found = self._stages.facility.step(
+        results = self._stages.facility.step(
             self._state, self._commands, self._surroundings, self._supply, self._air
         )
-        possible = (found["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
+        possible = (results["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
         return SteadyStep(
-            facility_kwh=found["it_kwh"] + found["overhead_w"] * self._step_h / 1e3,
-            water_l=found["water_l"],
-            unmet_w=np.where(possible, found["unmet_w"], np.inf),
+            facility_kwh=results["it_kwh"] + results["overhead_w"] * self._step_h / 1e3,
+            water_l=results["water_l"],
+            unmet_w=np.where(possible, results["unmet_w"], np.inf),
         )
 
     def close(self) -> None:

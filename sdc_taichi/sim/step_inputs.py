@@ -64,7 +64,7 @@ class UnitIndex:
 
 
 MOST_MOVES = 1e6
-"""Most steps by which a setpoint or a fan may be told to move, far beyond the range of either."""
+"""Largest command of a setpoint or a fan, in steps; far beyond the range of either."""
 
 
 @dataclass
@@ -106,25 +106,25 @@ class ActionDecoder:
         """
         if actions is not None and not isinstance(actions, Actions):
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
-        given = actions or Actions()
-        load_command = self._command("load", given.load, LoadAction, limit=1.0)
-        battery_command = self._command("battery", given.battery, BatteryAction, limit=1.0)
-        cooling = CoolAction.HOLD if given.cooling is None else given.cooling
+        wanted = actions or Actions()
+        load_command = self._command("load", wanted.load, LoadAction, limit=1.0)
+        battery_command = self._command("battery", wanted.battery, BatteryAction, limit=1.0)
+        cooling = CoolAction.HOLD if wanted.cooling is None else wanted.cooling
         unit_cooling_command = self._unit_command("cooling", cooling, CoolAction)
         return Commands(
             load_command=load_command,
             battery_command=battery_command,
             cooling_command=self._units.mean(unit_cooling_command),
             unit_cooling_command=unit_cooling_command,
-            follows_schedule=given.cooling is None,
-            unit_fan_command=self._fan_command(given.fan),
-            group_weights=self._group_weights(given.placement),
+            follows_schedule=wanted.cooling is None,
+            unit_fan_command=self._fan_command(wanted.fan),
+            group_weights=self._group_weights(wanted.placement),
         )
 
-    def _fan_command(self, given: Any) -> F64 | None:
-        if given is FanAction.HOLD:
+    def _fan_command(self, action: Any) -> F64 | None:
+        if action is FanAction.HOLD:
             return None
-        command = self._unit_command("fan", given, FanAction)
+        command = self._unit_command("fan", action, FanAction)
         if self._flow_model == "controlled":
             return command
         if np.any(command):
@@ -134,9 +134,9 @@ class ActionDecoder:
             )
         return None
 
-    def _group_weights(self, given: Any) -> F64 | None:
+    def _group_weights(self, placement: Any) -> F64 | None:
         """Weights of the server groups, (G,), from one per rack or per group."""
-        if given is None:
+        if placement is None:
             return None
         if self._placement != "weights":
             raise SdcError(
@@ -145,9 +145,9 @@ class ActionDecoder:
             )
         racks, groups = self._fleet.racks, self._fleet.groups
         try:
-            weights = np.asarray(given, dtype=np.float64)
+            weights = np.asarray(placement, dtype=np.float64)
         except (TypeError, ValueError):
-            raise SdcError(f"action placement: {given!r} are no numbers") from None
+            raise SdcError(f"action placement: {placement!r} are no numbers") from None
         if weights.shape == (groups,):
             return weights
         if weights.shape == (racks,):
@@ -157,32 +157,32 @@ class ActionDecoder:
             f"({groups},), one per server group"
         )
 
-    def _unit_command(self, name: str, given: Any, kind: type[Enum]) -> F64:
+    def _unit_command(self, name: str, action: Any, kind: type[Enum]) -> F64:
         """A command for each CRAC unit, (U,), given for all, per data center or per unit."""
-        command = self._command(name, given, kind, limit=MOST_MOVES, also=self._n_units)
+        command = self._command(name, action, kind, limit=MOST_MOVES, also=self._n_units)
         return command if len(command) == self._n_units else self._units.of_each(command)
 
     def _command(
         self,
         name: str,
-        given: Any,
+        action: Any,
         kind: type[Enum],
         *,
         limit: float,
         also: int | None = None,
     ) -> F64:
         """A finite command within -limit..limit for each data center, (B,), or ``also`` entries."""
-        if isinstance(given, Enum):
-            if not isinstance(given, kind):
-                raise SdcError(f"action {name}: {given} is no {kind.__name__}")
-            return np.full(self._size, float(given.value))
-        if isinstance(given, list | tuple) and any(isinstance(x, Enum) for x in given):
-            given = [x.value if isinstance(x, kind) else x for x in given]
+        if isinstance(action, Enum):
+            if not isinstance(action, kind):
+                raise SdcError(f"action {name}: {action} is no {kind.__name__}")
+            return np.full(self._size, float(action.value))
+        if isinstance(action, list | tuple) and any(isinstance(x, Enum) for x in action):
+            action = [x.value if isinstance(x, kind) else x for x in action]
         try:
-            command = np.asarray(given, dtype=np.float64)
+            command = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
             raise SdcError(
-                f"action {name}: {given!r} is neither {kind.__name__} nor numbers"
+                f"action {name}: {action!r} is neither {kind.__name__} nor numbers"
             ) from None
         if command.shape not in ((), (self._size,), (also,)):
             valid = dict.fromkeys([(), (self._size,), *([] if also is None else [(also,)])])
