@@ -165,7 +165,7 @@ UNIT_STATE = {
     "fresh_ratio": "share of the racks' need for its air that the unit covers, f of docs/hall.md",
     "fresh_ratio_used": "fresh_ratio that the last sweep computed the racks with",
     "flow_m3s": "airflow, in transient halls mean over the substeps so far, m3/s",
-    "cubed_speed": "cube of the fan speed over full speed, 0 where coasting, in transient halls mean so far",
+    "cubed_speed": "cube of the fan speed over full speed, 0 where coasting, mean as flow_m3s",
     "need_m3s": "supply air that the racks ask for, m3/s",
     "following": "fan speed over full speed that would just cover the need",
     "speed": "fan speed over full speed in the present sweep",
