@@ -299,7 +299,7 @@ def test_a_file_that_is_no_snapshot_is_refused(tmp_path: Path) -> None:
         damaged = whole[:200] + bytes(60) + whole[260:]
         for content in (b"", b"no zip archive", whole[: len(whole) // 2], damaged, array):
             (tmp_path / "other.npz").write_bytes(content)
-            with pytest.raises(SdcError, match=r"other\.npz: cannot be read as an \.npz file"):
+            with pytest.raises(SdcError, match=r"other\.npz: cannot be read as "):
                 sim.load(tmp_path / "other.npz")
         with pytest.raises(SdcError, match=r"none\.npz: no such file"):
             sim.load(tmp_path / "none.npz")
