@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
@@ -68,19 +67,6 @@ def test_markdown_shows_texts_as_they_are(study: Path, tmp_path: Path) -> None:
     assert "    sdc-taichi benchmark made-up" in lines
     assert "- g36: a \\| pipe, \\<b\\>markup\\</b\\> and \\_more\\_" in lines
     assert any(line.startswith("| mpc-24h | 1 | 1 | -8.97 (") for line in lines)
-
-
-def test_recordings_are_linked_from_where_the_report_is(study: Path, tmp_path: Path) -> None:
-    store = ResultStore(Path(shutil.copytree(study, tmp_path / "a study")))
-    files = {"a <b>.rrd": b""}
-    store.keep(done_job("g36", 0, frames_of_row("g36", 0), spec=ROWS["g36"], files=files))
-    out = tmp_path / "tables.md"
-    write_report([store.folder], markdown=out)
-    link = (
-        "- [g36, seed 0: a \\<b\\>.rrd]"
-        "(<a%20study/jobs/suite%3Dmade-up/case%3Dtwo-sites/row%3Dg36/seed%3D0/a%20%3Cb%3E.rrd>)"
-    )
-    assert link in out.read_text("utf-8").splitlines()
 
 
 def test_notes_tell_what_is_missing_or_mixed(tmp_path: Path) -> None:

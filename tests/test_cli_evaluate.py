@@ -20,7 +20,6 @@ from sdc_taichi.cli import evaluate as commands
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning import evaluation
 from sdc_taichi.learning.policy import About, Policy
-from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.result import Optimum
 
 CASE = ("--config", "tiny", "--site", "ny,ca", "--weeks", "27", "--days", "2")
@@ -52,19 +51,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         Policy(networks, of, About(algorithm=algorithm, seed=seed, steps=100)).save(folder / name)
     return folder
-
-
-@pytest.mark.parametrize(
-    ("names", "said"),
-    [(("gready-ci",), "did you mean 'greedy-ci'"), (("g36", "g36"), "g36 is given twice")],
-)
-def test_controllers_are_refused_before_an_optimum_is_solved(
-    names: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(evaluation, "solve", None)
-    done = call(*CASE, *(text for name in names for text in ("--controller", name)))
-    assert done.exit_code == 2
-    assert said in done.stderr
 
 
 def test_seeds_are_put_together_and_files_tell_all(runs: Path, tmp_path: Path) -> None:
@@ -118,16 +104,6 @@ def test_without_an_optimum_there_is_no_share(runs: Path, monkeypatch: pytest.Mo
     assert json.loads(asked.stdout)["summary"] == content["summary"]
 
 
-def test_an_interrupted_solution_is_told(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(*_: Any, **__: Any) -> Any:
-        raise StoppedError("1 of 2 data centers are kept")
-
-    monkeypatch.setattr(evaluation, "solve", stopped)
-    done = call(runs / "b", *CASE)
-    assert done.exit_code == 130
-    assert done.stderr == "interrupted: 1 of 2 data centers are kept\n"
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -150,9 +126,7 @@ def test_an_interruption_before_the_first_run_is_told(
     [
         ((), "nothing to evaluate; valid is RUN or --controller"),
         (("runs/none", *CASE), "runs/none: no such folder"),
-        (("--controller", "g36", "--weeks", "held"), "weeks 'held': 'held'; valid are held-out"),
         (("--controller", "g38", *CASE), "controller 'g38': unknown"),
-        (("--controller", "g36", *CASE[:2], "--site", "XX"), "XX"),
         (("--controller", "g36", *CASE, "--objective", "coal"), "objective 'coal'"),
         (("{runs}/b", *CASE, "--set", "simulation.steps_per_hour=2"), "b: does not fit these data"),
         (("{runs}/b", *CASE, "--out", "{runs}"), "holds other files (a-0, a-1, b)"),

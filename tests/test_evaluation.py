@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from sdc_taichi.learning.evaluation import (
     prepare,
     validate,
 )
-from sdc_taichi.optimum.problem import Ends
 from sdc_taichi.optimum.result import Optimum, with_tabled_ends
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.workload import queue_limit_tasks
@@ -172,24 +170,6 @@ def test_what_cannot_be_evaluated_is_named(weeks: DataCenterWeeks) -> None:
         prepare([], (3,))
     with pytest.raises(ConfigError, match=r"days.* 1"):
         prepare(CONFIGS, (3,), days=1)
-
-
-def test_tabled_ends_are_lines_between_bounds(weeks: DataCenterWeeks) -> None:
-    assert weeks.optimum is not None
-    capacity_kwh = float(weeks.sim.sizing.battery_kwh[1])
-
-    def bent(dc: int, ends: Ends) -> float:
-        return (ends.end_kwh - ends.start_kwh + capacity_kwh) ** 2 + 0.5 * ends.end_tasks
-
-    bent_ends = replace(weeks.optimum, bound_of_ends=bent)
-    table = with_tabled_ends(bent_ends, weeks.sim).bound_of_ends
-    node, between = 0.65 * capacity_kwh, 0.5 * capacity_kwh
-    start = Ends(between, 3.0, between, 3.0)
-    exact = (bent(1, Ends(capacity_kwh / 2, 0, x, 0)) for x in (node, 0.35 * capacity_kwh))
-    at_node = table(1, Ends(0.0, 0.0, node, 40.0))
-    high, low = exact
-    assert at_node == pytest.approx(high + 20.0)
-    assert table(1, start) == pytest.approx((high + low) / 2 + 1.5)
 
 
 def test_tabled_ends_are_near_the_bounds() -> None:

@@ -9,12 +9,10 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
 
-import sdc_taichi  # noqa: E402
 from sdc_taichi.errors import ConfigError  # noqa: E402
 from sdc_taichi.learning.algorithms import CrossEntropySettings  # noqa: E402
 from sdc_taichi.learning.cross_entropy import CrossEntropySearch  # noqa: E402
 from sdc_taichi.learning.stream import (  # noqa: E402
-    EnvironmentStream,
     LearnerSpaces,
     StreamStep,
 )
@@ -85,24 +83,3 @@ def test_search_needs_a_data_center_for_each_candidate() -> None:
     game: Any = Game(lambda seen: seen[:, 0], discrete=False)
     with pytest.raises(ConfigError, match=r"learning\.candidates 65: there are 64 data centers"):
         search(game, 1, candidates=65)
-
-
-def test_search_beats_idle_batteries() -> None:
-    env = sdc_taichi.vector_env(
-        16,
-        "tiny",
-        agents=["agent_bat"],
-        days=1,
-        start="fixed",
-        autoreset_mode="SameStep",
-        rewards=lambda result, view: -result.carbon_g / result.facility_kwh,
-    )
-    stream = EnvironmentStream(env, shares_state=False)
-    hold = {"agent_bat": torch.ones(16, 1, dtype=torch.int64)}
-    idle = np.mean([float(stream.step(hold).rewards["agent_bat"].mean()) for _ in range(96)])
-    settings = CrossEntropySettings(candidates=16, first_std=1.0)
-    algorithm = CrossEntropySearch(settings, stream, updates=12, seed=0)
-    rewards = [algorithm.update(stream)["reward/agent_bat"] for _ in range(12)]
-    env.close()
-    assert np.mean(rewards[-3:]) > np.mean(rewards[:2])
-    assert np.mean(rewards[-3:]) > idle

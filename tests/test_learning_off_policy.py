@@ -15,17 +15,16 @@ from torch import Tensor  # noqa: E402
 
 from learning_games import Aim, Coordination, Meeting  # noqa: E402
 from sdc_taichi.errors import ConfigError, SdcError  # noqa: E402
-from sdc_taichi.learning.action_values import JointValues, expected  # noqa: E402
 from sdc_taichi.learning.algorithms import OFF_POLICY, OffPolicySettings  # noqa: E402
+from sdc_taichi.learning.networks import ContinuousValues, JointValues, expected  # noqa: E402
 from sdc_taichi.learning.off_policy import (  # noqa: E402
     OffPolicy,
     Replay,
     critic_loss,
 )
 from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
-    Temperatures,
+    GaussianActors,
     best_replies,
-    entropies,
     soft_policy_loss,
     squashed,
 )
@@ -107,11 +106,6 @@ def test_the_expected_value_of_open_choices_is_that_of_each_of_them() -> None:
         torch.testing.assert_close(rows[:, 3 * first + last], expected(table, fixed)[:, 0])
 
 
-def test_even_choices_have_the_largest_entropy() -> None:
-    even = torch.full((1, 2, 3), 1 / 3).log()
-    assert entropies(even).item() == pytest.approx(2 * math.log(3))
-
-
 def test_the_density_of_squashed_numbers_integrates_to_one() -> None:
     actions = torch.linspace(-0.9999, 0.9999, 20_001, dtype=torch.float64)[:, None]
     mean, log_std = torch.full_like(actions, 0.4), torch.full_like(actions, -0.5)
@@ -180,10 +174,14 @@ def test_a_replay_too_small_for_its_transitions_is_refused() -> None:
 
 
 def test_temperatures_rise_below_the_wanted_entropy_and_fall_above_it() -> None:
-    temperatures = Temperatures({"low": 0.5, "high": 0.5}, SMALL)
-    temperatures.follow("low", torch.tensor(0.1))
-    temperatures.follow("high", torch.tensor(0.9))
-    assert temperatures.of("low") > SMALL.temperature > temperatures.of("high")
+    game: Any = Aim(players=2, discrete=False)
+    critic = ContinuousValues(1, 1, 2, SMALL, torch.Generator())
+    actors = GaussianActors(critic, game.spaces, SMALL, torch.Generator())
+    for name, entropy in zip(game.spaces, (-1.1, -0.9), strict=True):
+        loss = actors.nets[name](torch.ones(1, 1)).sum()
+        actors._step(name, loss, torch.tensor(entropy))
+    low, high = map(actors.temperature, game.spaces)
+    assert low > SMALL.temperature > high
 
 
 def test_actions_that_an_algorithm_does_not_take_are_refused() -> None:

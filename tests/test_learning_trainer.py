@@ -209,29 +209,6 @@ def test_a_diverging_training_says_which_loss_and_keeps_the_last_policy(
     assert_equal_trainings(whole.folder, tmp_path)
 
 
-def test_weights_that_are_no_numbers_end_a_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-
-    def broken(*given: Any, **named: Any) -> Any:
-        made: Any = make_algorithm(*given, **named)
-        update = made.update
-
-        def and_break(stream: Any) -> dict[str, float]:
-            numbers = update(stream)
-            with torch.no_grad():
-                made._actors["agent_dc"].net[0].weight[0, 0] = float("nan")
-            return dict(numbers)
-
-        monkeypatch.setattr(made, "update", and_break)
-        return made
-
-    monkeypatch.setattr(trainer, "make_algorithm", broken)
-    with pytest.raises(SdcError, match=r"update 1: network of agent_dc: weight of layer 0 has nan"):
-        train(settings(), tmp_path)
-    assert not (tmp_path / "policy").exists()
-
-
 def test_a_full_disk_ends_a_training_with_the_checkpoint_before(
     whole: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

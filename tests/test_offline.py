@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,16 +81,6 @@ def test_scores_are_0_for_idle_commands_and_1_for_the_optimum(root: Path) -> Non
     assert "| optimum | 2 | 192 |" in card
     assert "| 57 | dc\\_load |" in card  # the last of 58 entries
     assert "| 2 | agent\\_bat | battery |" in card
-
-
-@pytest.mark.repo
-def test_the_lines_of_the_docs_read_it(root: Path) -> None:
-    page = (DOCS / "offline-data.md").read_text(encoding="utf-8")
-    (code,) = re.findall("```python\n(.*?)```", page, flags=re.DOTALL)
-    names: dict[str, Any] = {}
-    here = code.replace("datasets/sdc_taichi/corrected-ny-v0", (root / ID).as_posix())
-    exec(compile(here, "offline-data.md", "exec"), names)
-    names["env"].close()
 
 
 def test_the_same_command_gives_the_same_bytes(root: Path, tmp_path: Path) -> None:

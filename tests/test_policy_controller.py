@@ -133,17 +133,6 @@ def test_commands_of_several_units_and_fans_are_those_of_the_training() -> None:
     assert varied(results, "crac_fan_w")
 
 
-def test_a_data_center_is_the_same_alone_and_in_a_batch() -> None:
-    configs = fleet_of()
-    made = policy(interface(), seed=3)
-    together = run(configs, made, 40)
-    for i, config in enumerate(configs):
-        alone = run([config], made, 40)
-        for name in COMMANDS:
-            mine = [getattr(result, name)[0] for result in alone]
-            assert mine == [getattr(result, name)[i] for result in together]
-
-
 def test_forecasts_err_as_those_that_learners_of_the_episode_see() -> None:
     error = ForecastError(ci_share=0.5, temperature_k=5.0)
     configs = fleet_of()

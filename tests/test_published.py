@@ -11,7 +11,7 @@ import pytest
 
 from made_studies import ROWS, done_job, frames_of_row, write_study
 from published import FIGURES, FOLDER, SUITES, cells, described, suite_of, tolerance
-from sdc_taichi import SdcError, make_controller
+from sdc_taichi import make_controller
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
@@ -112,23 +112,3 @@ def test_tables_pictures_and_cells_of_a_suite(
         ["ippo", "policy:ippo", "ca", "3"],
     ]
     assert [path.name for path in (out / "made-up" / "ippo").iterdir()] == ["policy.json"]
-
-
-def test_results_that_are_not_those_of_a_suite_are_refused(
-    publisher: ModuleType, docs: Path, tmp_path: Path
-) -> None:
-    before = (docs / "benchmark.md").read_text("utf-8")
-    part = write_study(tmp_path / "part", leave_out=["made-up/two-sites/ippo/1"])
-    with pytest.raises(SdcError, match=r"two-sites: ippo, seed 1 is missing; valid are all"):
-        publisher.publish([part], docs, tmp_path / "cells")
-    mixed = write_study(tmp_path / "mixed")
-    ResultStore(mixed).keep(
-        done_job("g36", 0, frames_of_row("g36", 0), spec=ROWS["g36"], source="1" * 64)
-    )
-    with pytest.raises(SdcError, match=r"of source 0{12} and 1{12}; valid is one"):
-        publisher.publish([mixed], docs, tmp_path / "cells")
-    assert (docs / "benchmark.md").read_text("utf-8") == before
-    assert not (tmp_path / "cells").exists()
-    (docs / "benchmark.md").write_text("# Results\n")
-    with pytest.raises(SdcError, match="no line <!-- made-up -->"):
-        publisher.publish([write_study(tmp_path / "whole")], docs, tmp_path / "cells")

@@ -129,30 +129,6 @@ def test_a_worker_that_is_killed_loses_nothing(tmp_path: Path, cluster: RayClust
     assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
 
 
-def test_jobs_that_fail_do_so_in_one_line_each_and_alone(
-    tmp_path: Path, cluster: RayCluster
-) -> None:
-    jobs = [toy_jobs.job(name, 1) for name in ("refuse", "divide", "killed", "draw")]
-    done = run_jobs(jobs, ResultStore(tmp_path), cluster)
-    failed = dict(done.failed)
-    assert done.done == 1
-    assert failed.pop("toy/c/refuse/1") == "number 1: valid is another"
-    assert failed.pop("toy/c/divide/1").startswith("ZeroDivisionError: ")
-    assert list(failed) == ["toy/c/killed/1"]
-    assert failed["toy/c/killed/1"].startswith("Ray could not finish it: The worker died")
-
-
-def test_stopping_leaves_jobs_for_the_next_time(tmp_path: Path, cluster: RayCluster) -> None:
-    ended: list[Job] = []
-    store, jobs = ResultStore(tmp_path), draws(6, seconds=0.2)
-    done = run_jobs(
-        jobs, store, cluster, stop=lambda: bool(ended), on_done=lambda job, _: ended.append(job)
-    )
-    assert 1 <= done.done < 6
-    assert not done.is_whole
-    assert run_jobs(jobs, store, cluster).kept == done.done
-
-
 def test_other_source_on_a_machine_ends_the_study(
     tmp_path: Path, cluster: RayCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:

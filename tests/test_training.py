@@ -136,20 +136,6 @@ def test_torchrl_env_gives_what_the_batch_gives(example: Load) -> None:
     twin.close()
 
 
-def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: Load) -> None:
-    rl = example("torchrl_env", "torchrl", "tensordict")
-    env = rl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=4)
-    start = env.reset()
-    env.rollout(5, auto_reset=False, tensordict=start.clone())
-    env.set_seed(4)
-    np.testing.assert_array_equal(env.reset()["state"], start["state"])
-    part = env.reset()
-    part["_reset"] = importlib.import_module("torch").tensor([[True], [False]])
-    with pytest.raises(ValueError, match="single ones cannot be reset"):
-        env.reset(part)
-    env.close()
-
-
 # --- RLlib ---
 
 RLLIB = """

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from sdc_taichi import EnvOptions
 from sdc_taichi.cli.app import app
-from sdc_taichi.cli.terminal import duration
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.split import TRAINING
@@ -76,10 +75,8 @@ def test_difference_names_the_setting_and_both_values() -> None:
         ({"learning": {"epoch": 1}}, "settings of happo: epoch: unknown key; did you mean 'epochs"),
         ({"learning": {"discount": 2}}, "discount: Input should be less than or equal to 1"),
         ({"steps": 1.5}, "steps: .* valid integer"),
-        ({"steps": 0}, "steps: .* greater than or equal to 1"),
         ({"sites": ["NY", "ny"]}, r"sites: .* valid is each site once"),
         ({"weeks": [52]}, "weeks.*less than 52"),
-        ({"weeks": []}, "weeks: .* one or more weeks"),
         ({"scenario": "carbn"}, "scenario 'carbn'; did you mean 'carbon'"),
         ({"environment": {"day": 3}}, "environment.day: unknown key; did you mean 'days'"),
         ({"environment": {"days": 8}}, "environment.days 8: .* at most 7, or weeks null"),
@@ -145,7 +142,3 @@ def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> N
     assert found.output.count("\n") == 1
     assert 'pip install "sdc-taichi[train]"' in found.output
     assert not (tmp_path / "run").exists()
-
-
-def test_durations_are_short_texts() -> None:
-    assert [duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]

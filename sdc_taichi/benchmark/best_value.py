@@ -40,10 +40,10 @@ def with_default(sweep: Sweep) -> Sweep:
     Raises:
         ConfigError: no field can be chosen.
     """
-    grid, held = chosen_grid(sweep), value_at(sweep.config, chosen_grid(sweep).field)
-    if not isinstance(held, int | float) or isinstance(held, bool):
+    grid, default = chosen_grid(sweep), value_at(sweep.config, chosen_grid(sweep).field)
+    if not isinstance(default, int | float) or isinstance(default, bool):
         return sweep
-    varied = tuple(one.with_value(held) if one is grid else one for one in sweep.varied)
+    varied = tuple(one.with_value(default) if one is grid else one for one in sweep.varied)
     return replace(sweep, varied=varied)
 
 
@@ -130,7 +130,7 @@ def _months(
 
     each = np.arange(len(months))
     best, fixed = figures.argmin(axis=1), figures.sum(axis=0).argmin()
-    held = np.flatnonzero(values == default)
+    at_default = np.flatnonzero(values == default)
     nan = np.full(len(months), np.nan)
     table = pd.DataFrame(
         {
@@ -139,8 +139,8 @@ def _months(
             f"best_{metric}": figures[each, best],
             "fixed": values[fixed],
             f"fixed_{metric}": figures[:, fixed],
-            "default": values[held[0]] if held.size else nan,
-            f"default_{metric}": figures[:, held[0]] if held.size else nan,
+            "default": values[at_default[0]] if at_default.size else nan,
+            f"default_{metric}": figures[:, at_default[0]] if at_default.size else nan,
         }
     )
     table.loc[len(months)] = {**table.mean(numeric_only=True), "month": ALL_MONTHS, "best": np.nan}

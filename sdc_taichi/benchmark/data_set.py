@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdc_taichi.benchmark.episodes import Collection, Episode, objective_of_optimum
+from sdc_taichi.benchmark.episodes import IDLE, Collection, Episode, objective_of_optimum
 from sdc_taichi.benchmark.jobs import input_paths
 from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.learning.evaluation_table import literal_markdown, markdown
 from sdc_taichi.run.description import processor_features
 from sdc_taichi.sim.fleet_configs import locations
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _SCALED = (
     "An entry is (value - low) / (high - low), or value / high where the range lies evenly about "
@@ -27,6 +30,7 @@ _CONTROLLER_COLUMNS = (
     *("controller", "episodes", "steps", "mean return", "score (%)"),
     *("carbon against idle (%)", "cost against idle (%)", "commands changed (%)"),
 )
+_FIGURES = ("mean_return", "steps", "changed_commands", "episodes")
 _CONTROLLERS = (
     "Changes of carbon and energy cost are of the sums of all episodes; work that waits or energy "
     "that is stored at their ends has no value. Commands changed are those that the nearest action "
@@ -53,40 +57,6 @@ rows) and `infos/NAME` (T + 1, the first 0), and the attributes `controller`, `w
 `options/start_day`, `return` and `changed_commands`."""
 
 
-@dataclass(slots=True)
-class ControllerReturns:
-    """Returns of the episodes of a controller, and sums over their steps."""
-
-    controller: str
-    """Name of the controller."""
-    returns: list[float] = field(default_factory=list)
-    """Sum of the rewards of each episode."""
-    steps: int = 0
-    """Number of steps of all episodes."""
-    changed_commands: float = 0.0
-    """Share of the commands that the nearest action gives otherwise, summed over episodes."""
-    totals: dict[str, float] = field(default_factory=dict)
-    """Sum of each quantity of infos over all steps, by name."""
-
-    def add(self, episode: Episode) -> None:
-        """Add the rewards and quantities of an episode."""
-        self.returns.append(float(episode.rewards.sum()))
-        self.steps += len(episode.rewards)
-        self.changed_commands += episode.changed_commands
-        for name, values in episode.infos.items():
-            self.totals[name] = self.totals.get(name, 0.0) + float(values.sum())
-
-    @property
-    def episodes(self) -> int:
-        """Number of episodes."""
-        return len(self.returns)
-
-    @property
-    def mean_return(self) -> float:
-        """Mean over the episodes of the sum of their rewards."""
-        return float(np.mean(self.returns))
-
-
 @dataclass(frozen=True, slots=True)
 class DataSet:
     """A data set that has been written."""
@@ -97,24 +67,58 @@ class DataSet:
     """Folder with its card and the folder ``data``."""
     collection: Collection
     """Episodes that the data set holds."""
-    idle: ControllerReturns
-    """Returns of idle commands, whether their episodes are in it or not."""
-    controllers: tuple[ControllerReturns, ...]
-    """Returns of the controllers whose episodes are in it, in their order."""
+    returns: pd.DataFrame
+    """A row for each controller, that of idle commands first even where it is not in the data set,
+    with ``episodes``, ``steps``, ``mean_return``, ``changed_commands`` (share of the commands that
+    the nearest action gives otherwise) and the sum of each quantity of infos."""
 
     @property
-    def best(self) -> ControllerReturns | None:
-        """Returns of the first known optimum that earns more than idle commands, if any."""
-        known = (each for each in self.controllers if is_optimum(each.controller))
-        return next((each for each in known if each.mean_return > self.idle.mean_return), None)
+    def best(self) -> str | None:
+        """The first known optimum that earns more than idle commands, if any."""
+        optima = [name for name in self.collection.controllers if is_optimum(name)]
+        return next((name for name in optima if self.mean_return(name) > self.mean_return()), None)
 
-    def score(self, mean_return: float) -> float | None:
-        """Share of the way from idle commands to the known optimum; None without one."""
-        if self.best is None:
-            return None
-        return (mean_return - self.idle.mean_return) / (
-            self.best.mean_return - self.idle.mean_return
-        )
+    def mean_return(self, controller: str = IDLE) -> float:
+        """Mean of the sum of the rewards of an episode of a controller."""
+        return float(self.returns["mean_return"][controller])
+
+    def score(self, controller: str) -> float:
+        """Share of the way from idle commands to the known optimum; nan without one."""
+        idle, best = self.mean_return(), self.best
+        if best is None:
+            return math.nan
+        return (self.mean_return(controller) - idle) / (self.mean_return(best) - idle)
+
+
+def returns_of(episodes: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """The table ``DataSet.returns`` of the episodes of all controllers.
+
+    Args:
+        episodes: figures of each episode, of ``figures_of``.
+    """
+    import pandas as pd
+
+    of_controllers = pd.DataFrame(episodes).groupby("controller", sort=False)
+    table = of_controllers.sum()
+    table["episodes"] = of_controllers.size()
+    for name in ("mean_return", "changed_commands"):
+        table[name] /= table["episodes"]
+    return table
+
+
+def figures_of(episode: Episode) -> dict[str, Any]:
+    """Controller, return, number of steps and sums of an episode.
+
+    Args:
+        episode: the episode.
+    """
+    return {
+        "controller": episode.controller,
+        "mean_return": float(episode.rewards.sum()),
+        "steps": len(episode.rewards),
+        "changed_commands": episode.changed_commands,
+        **{name: float(values.sum()) for name, values in episode.infos.items()},
+    }
 
 
 def is_optimum(controller: str) -> bool:
@@ -132,12 +136,13 @@ def card(made: DataSet, command: str) -> str:
     with closing(made.collection.make_batch(1)) as env:
         parts = [
             f"# {made.id}",
-            f"Episodes of a simulated data center under {len(made.controllers)} controllers, for "
+            "Episodes of a simulated data center under "
+            f"{len(made.collection.controllers)} controllers, for "
             "offline reinforcement learning, in the format of Minari.",
             _table(("fact", "value"), _facts(made, env)),
             "## Controllers",
             _table(_CONTROLLER_COLUMNS, _controllers(made)),
-            _SCORES.format(made.best.controller) if made.best is not None else "",
+            _SCORES.format(made.best) if made.best is not None else "",
             _CONTROLLERS,
             "## Observations",
             _SCALED if env.core.options.observations == "default" else "",
@@ -145,7 +150,7 @@ def card(made: DataSet, command: str) -> str:
             "## Actions",
             _table(("entries", "agent", "commands"), _actions(env)),
             "The documentation of environments explains the commands. Infos of each step: "
-            f"{', '.join(f'`{name}`' for name in made.idle.totals)}.",
+            f"{', '.join(f'`{name}`' for name in made.returns if name not in _FIGURES)}.",
             "## Loading",
             _LOADING.format(id=made.id, folder=made.id, version=version("sdc-taichi")),
             "## Making it again",
@@ -171,7 +176,7 @@ def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, Any]]:
     return [
         ("environment", f"{collection.environment_id}, with all arguments in its spec"),
         ("data center", f"{collection.config.name}, site {locations([collection.config])[0]}"),
-        ("episodes", str(sum(each.episodes for each in made.controllers))),
+        ("episodes", str(made.returns["episodes"][list(collection.controllers)].sum())),
         ("steps of an episode", f"{env.core.steps}, after which it is cut off"),
         ("length of a step", f"{60 // env.core.sim.fleet.steps_per_hour} min"),
         ("weeks", f"{', '.join(map(str, collection.weeks))} of the year, from 0"),
@@ -186,19 +191,19 @@ def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, Any]]:
 
 def _controllers(made: DataSet) -> Iterator[tuple[Any, ...]]:
     """Rows of the table of controllers, one of idle commands among them."""
-    names = [each.controller for each in made.controllers]
-    reference = [] if made.idle.controller in names else [made.idle]
-    for each in [*reference, *made.controllers]:
-        score = made.score(each.mean_return)
+    idle = made.returns.loc[IDLE]
+    for name, row in made.returns.iterrows():
         yield (
-            each.controller if each.controller in names else f"{each.controller} (not in it)",
-            each.episodes,
-            each.steps,
-            each.mean_return,
-            math.nan if score is None else 100.0 * score,
-            _change_pct(each, made.idle, "carbon_g"),
-            _change_pct(each, made.idle, "energy_cost"),
-            100.0 * each.changed_commands / each.episodes,
+            name if name in made.collection.controllers else f"{name} (not in it)",
+            int(row["episodes"]),
+            int(row["steps"]),
+            row["mean_return"],
+            100.0 * made.score(str(name)),
+            *(
+                100.0 * (row[quantity] / idle[quantity] - 1.0) if idle.get(quantity) else math.nan
+                for quantity in ("carbon_g", "energy_cost")
+            ),
+            100.0 * row["changed_commands"],
         )
 
 
@@ -238,9 +243,3 @@ def _licence(collection: Collection, env: SdcVectorEnv) -> str:
         "Observations follow from these inputs, whose licences apply to what is published: "
         f"{literal_markdown(sources)}."
     )
-
-
-def _change_pct(reached: ControllerReturns, idle: ControllerReturns, name: str) -> float:
-    """Change of a sum against that of idle commands, in %; nan where that is 0."""
-    base = idle.totals.get(name, 0.0)
-    return 100.0 * (reached.totals[name] / base - 1.0) if base else math.nan

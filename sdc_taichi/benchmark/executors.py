@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import multiprocessing
 import os
 import signal
@@ -92,21 +93,14 @@ class LocalProcesses(Executor):
         """Run jobs as ``Executor.results`` does."""
         before = set(multiprocessing.active_children())
         idle: list[ProcessPoolExecutor] = []
-        again: list[tuple[Job, int]] = []
+        waiting: Iterator[tuple[Job, int]] = zip(jobs, itertools.repeat(1))
         running: dict[Future[DoneJob], tuple[ProcessPoolExecutor, Job, int]] = {}
-
-        def hand_out() -> None:
-            while len(running) < self._workers:
-                job, attempt = again.pop() if again else (next(jobs, None), 1)
-                if job is None:
-                    return
-                pool = idle.pop() if idle else _pool_of_one(inputs)
-                with _interrupts_blocked():
-                    running[pool.submit(_run_in_worker, job)] = pool, job, attempt
-
         try:
             while not stop():
-                hand_out()
+                for job, attempt in itertools.islice(waiting, self._workers - len(running)):
+                    pool = idle.pop() if idle else _pool_of_one(inputs)
+                    with _interrupts_blocked():
+                        running[pool.submit(_run_in_worker, job)] = pool, job, attempt
                 if not running:
                     return
                 ended = []
@@ -117,11 +111,9 @@ class LocalProcesses(Executor):
                         idle.append(pool)
                     except BrokenProcessPool:
                         if attempt < MOST_ATTEMPTS:
-                            again.append((job, attempt + 1))
+                            waiting = itertools.chain([(job, attempt + 1)], waiting)
                         else:
                             ended.append(DoneJob(job, _killed(attempt)))
-                if ended and not stop():
-                    hand_out()  # so that processes work while results are written
                 yield from ended
         finally:
             for pool in [*idle, *(pool for pool, *_ in running.values())]:

@@ -22,11 +22,16 @@ from sdc_taichi.benchmark.suite_results import (
     CaseResults,
     evaluation_of,
 )
-from sdc_taichi.learning.evaluation import ALL, IDLE, Evaluation
-from sdc_taichi.learning.evaluation_table import TITLES, by_site, samples, summary
+from sdc_taichi.learning.evaluation import IDLE, Evaluation
+from sdc_taichi.learning.evaluation_table import (
+    TITLES,
+    by_site,
+    column_samples,
+    samples,
+    summary,
+)
 from sdc_taichi.learning.statistics import (
     DRAWS,
-    Interval,
     Statistic,
     bootstrap_values,
     change_pct,
@@ -204,13 +209,13 @@ def _standings(
              for x in ends.values()]  # fmt: skip
     table.insert(0, "place", texts)
     for metric in CONSTRAINTS:
-        values = row_samples(evaluation, metric)
+        values = column_samples(evaluation, metric)
         if any(np.nan_to_num(sample).any() for sample in values.values()):
             columns = []
             for name in order:
                 drawn = _bootstrap(evaluation, sample_mean, (values[name],), name)
                 mean = percentile_interval(float(sample_mean(values[name])), drawn)
-                columns.append(interval_columns(metric, mean))
+                columns.append(mean.columns(metric))
             table[list(columns[0])] = pd.DataFrame(columns, index=order)
     table["core_min"] = [
         sum(result.record.core_s for result in case.rows[name]) / 60 for name in order
@@ -249,24 +254,8 @@ def _difference(
     return {
         "row": one,
         "than": other,
-        **interval_columns("points", percentile_interval(points, drawn[one] - drawn[other])),
-        **interval_columns("probability", percentile_interval(probability, values)),
-    }
-
-
-def row_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
-    """Values of each row by training and week, (S, W) each; none of a column that is not there.
-
-    Args:
-        evaluation: the evaluation.
-        column: column of its rows.
-    """
-    rows = evaluation.rows[evaluation.rows["moves"] == ALL]
-    width = len(evaluation.strata)
-    return {
-        str(name): group[column].to_numpy(np.float64).reshape(-1, width)
-        for name, group in rows.groupby("controller", sort=False)
-        if column in rows
+        **percentile_interval(points, drawn[one] - drawn[other]).columns("points"),
+        **percentile_interval(probability, values).columns("probability"),
     }
 
 
@@ -286,25 +275,15 @@ def _bootstrap(
     return bootstrap_values(statistic, samples, weeks, _generator(name), paired=paired)
 
 
-def interval_columns(name: str, interval: Interval) -> dict[str, float]:
-    """Columns of an interval in a table: the value and the two ends.
-
-    Args:
-        name: column of the value.
-        interval: the interval.
-    """
-    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
-
-
 def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -> pd.DataFrame:
     """Share of weeks above shares of the achievable, in %."""
     import pandas as pd
 
     thresholds = np.array(THRESHOLDS_PCT)
     table = []
-    shares = {name: 100.0 * profile for name, profile in row_samples(evaluation, "share").items()}
+    shares = column_samples(evaluation, "share")
     for name in order:
-        sample = shares[name]
+        sample = 100.0 * shares[name]
         if case.kinds[name] in (ACHIEVED, BOUND) or not np.isfinite(sample).any():
             continue
         drawn = _bootstrap(
@@ -314,7 +293,7 @@ def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -
         row: dict[str, Any] = {"row": name}
         for index, threshold in enumerate(THRESHOLDS_PCT):
             interval = percentile_interval(100.0 * float(profile[index]), 100.0 * drawn[:, index])
-            row |= interval_columns(f"above_{threshold:g}_pct", interval)
+            row |= interval.columns(f"above_{threshold:g}_pct")
         table.append(row)
     return pd.DataFrame(table)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.atomic_file import FileClaim, naming_errors
-from sdc_taichi.benchmark.data_set import ControllerReturns, DataSet, card
+from sdc_taichi.benchmark.data_set import DataSet, card, figures_of, returns_of
 from sdc_taichi.benchmark.episodes import IDLE, Collection, Episode, Progress, episodes
 from sdc_taichi.errors import ConfigError, SdcError
 
@@ -100,15 +100,13 @@ def write_data_set(
     collection.check()
     with _new_folder(folder) as unfinished:
         storage = _new_storage(collection, unfinished / _DATA)
-        reached = {}
+        figures = []
         for name in dict.fromkeys((IDLE, *collection.controllers)):
-            reached[name] = returns = ControllerReturns(name)
             for episode in episodes(collection, name, progress=progress, stop=stop):
-                returns.add(episode)
+                figures.append(figures_of(episode))
                 if name in collection.controllers:
                     _keep(storage, episode)
-        of_collection = tuple(reached[name] for name in collection.controllers)
-        made = DataSet(data_set, folder, collection, reached[IDLE], of_collection)
+        made = DataSet(data_set, folder, collection, returns_of(figures))
         storage.update_metadata(_metadata(made))
         (unfinished / CARD_FILE).write_text(card(made, command), encoding="utf-8")
     return made
@@ -219,8 +217,8 @@ def _metadata(made: DataSet) -> dict[str, Any]:
     }
     if made.best is not None:
         metadata |= {
-            "ref_min_score": made.idle.mean_return,
-            "ref_max_score": made.best.mean_return,
-            "num_episodes_average_score": made.best.episodes,
+            "ref_min_score": made.mean_return(),
+            "ref_max_score": made.mean_return(made.best),
+            "num_episodes_average_score": int(made.returns["episodes"][made.best]),
         }
     return metadata

@@ -18,11 +18,8 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from sdc_taichi.benchmark.leaderboard import interval_columns
-from sdc_taichi.benchmark.report_blocks import Block, Table, Text
 from sdc_taichi.benchmark.suite_results import SuiteResults
-from sdc_taichi.config.fields import Section
-from sdc_taichi.config.fields import Text as FieldText
+from sdc_taichi.config.fields import Section, Text
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.learning.split import UNSCORED_DAYS
@@ -49,12 +46,12 @@ _NO_FIGURE = Interval(math.nan, math.nan, math.nan)
 
 PAPER = "paper"
 """Accounting of suites whose tables are those of SustainDC."""
-_CAPTION = "Our figures, carbon with 95 % intervals, beside those printed"
-_UNITS = (
-    " Columns are in the units that the printed ones hold, not in those of their headings: mean "
+PAPER_UNITS = (
+    "Columns are in the units that the printed ones hold, not in those of their headings: mean "
     "powers, carbon of a quarter hour at an intensity that is raised by that of the first hour of "
     "the year, and a sum of hourly rates of water."
 )
+"""Units of the columns, in words."""
 _COLUMNS = {
     "cfp_kg": "CFP (kg per quarter hour)",
     "hvac_kw": "HVAC (kW)",
@@ -93,7 +90,7 @@ class PaperFigures(NamedTuple):
 class PrintedRow(Section):
     """A row of a printed table."""
 
-    label: FieldText
+    label: Text
     """Name of the row as it is printed."""
     figures: PaperFigures
     """Figures of the row as they are printed."""
@@ -106,7 +103,7 @@ class PaperTable(Section):
     """Number of the table, 2..7."""
     panel: Annotated[str, Field(pattern="^[a-f]$")]
     """Panel of figure 4 that shows the table, a..f."""
-    title: FieldText
+    title: Text
     """Subject of the table."""
     case: str
     """Case of suite ``paper`` with the same data center and months."""
@@ -157,44 +154,6 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> pd.DataF
     return pd.DataFrame([_compared_row(name, table, samples.get(name), constant) for name in names])
 
 
-def finding(rows: pd.DataFrame) -> str:
-    """How the rows that the paper has compare with the constant lowest setpoint, in words.
-
-    Args:
-        rows: rows of a table, as ``compared`` returns them.
-
-    Returns:
-        Two sentences; empty where none of these rows has been run beside it.
-    """
-    printed = rows[rows["printed_cfp_kg"].notna()]
-    run = printed[printed["against_constant"].notna()]
-    if run.empty:
-        return ""
-    less, more = (run["against_constant_high"] < 0).sum(), (run["against_constant_low"] > 0).sum()
-    least, most = run["against_constant"].min(), run["against_constant"].max()
-    spread_pct = 100.0 * (printed["printed_cfp_kg"].max() / printed["printed_cfp_kg"].min() - 1.0)
-    return (
-        f"Of {len(run)} rows that the paper has, {less} emit less than the lowest setpoint "
-        f"held all the time, {more} more, and {len(run) - less - more} cannot be separated from "
-        f"it; they lie {least:+.2f} to {most:+.2f} % from it. As printed, their CFP spreads by "
-        f"{spread_pct:.1f} %."
-    )
-
-
-def _columns(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
-    """Figures of each row in the order of ``PaperFigures``, (N, 5)."""
-    metrics = {name: rows[name].to_numpy(np.float64) for name in _METRICS}
-    carbon_kg = metrics["cfp_kg"] + table.noise_base_g_per_kwh / 1e3 * metrics["grid_kwh"]
-    by_column = {
-        "cfp_kg": carbon_kg / (scored_h * _QUARTERS_PER_H),
-        "hvac_kw": metrics["hvac_kwh"] / scored_h,
-        "it_kw": metrics["it_kwh"] / scored_h,
-        "queue_tasks": metrics["queue_mean_tasks"],
-        "water_m3h": metrics["water_l"] / 1e3 / scored_h * table.water_steps,
-    }
-    return np.stack([by_column[name] for name in PaperFigures._fields], axis=1)
-
-
 def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
     """Figures by column, seed and week, (5, S, W), weeks in their order."""
     ordered = rows.sort_values(["seed", "week"])
@@ -204,7 +163,16 @@ def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
             f"table {table.number}: {len(ordered)} rows of {ordered['row'].iloc[0]} for {seeds} "
             f"seeds and {weeks} weeks; valid is one for each"
         )
-    return _columns(ordered, table, scored_h).T.reshape(-1, seeds, weeks)
+    metrics = {name: ordered[name].to_numpy(np.float64) for name in _METRICS}
+    carbon_kg = metrics["cfp_kg"] + table.noise_base_g_per_kwh / 1e3 * metrics["grid_kwh"]
+    figures = {
+        "cfp_kg": carbon_kg / (scored_h * _QUARTERS_PER_H),
+        "hvac_kw": metrics["hvac_kwh"] / scored_h,
+        "it_kw": metrics["it_kwh"] / scored_h,
+        "queue_tasks": metrics["queue_mean_tasks"],
+        "water_m3h": metrics["water_l"] / 1e3 / scored_h * table.water_steps,
+    }
+    return np.stack([figures[name] for name in PaperFigures._fields]).reshape(-1, seeds, weeks)
 
 
 def _compared_row(
@@ -218,7 +186,7 @@ def _compared_row(
     }
     for index, column in enumerate(PaperFigures._fields):
         ours = _NO_FIGURE if sample is None else _interval(sample_mean, sample[index])
-        row |= interval_columns(column, ours) if column == "cfp_kg" else {column: ours.value}
+        row |= ours.columns(column) if column == "cfp_kg" else {column: ours.value}
         row[f"printed_{column}"] = math.nan if printed is None else printed.figures[index]
     against_constant = _NO_FIGURE
     if sample is not None and constant is not None:
@@ -228,7 +196,7 @@ def _compared_row(
                 f"{constant.shape[2]}; valid is the same weeks"
             )
         against_constant = _interval(change_pct, sample[0], constant[0])
-    return row | interval_columns("against_constant", against_constant)
+    return row | against_constant.columns("against_constant")
 
 
 def _interval(statistic: Statistic, *samples: F64) -> Interval:
@@ -250,27 +218,16 @@ def paper_rows(suite: SuiteResults) -> pd.DataFrame:
     """
     import pandas as pd
 
-    tables = {table.number: rows for table, rows in _compared_tables(suite)}
+    tables = {table.number: rows for table, rows in compared_tables(suite)}
     return pd.concat(tables, names=["table"]).reset_index(level=0).reset_index(drop=True)
 
 
-def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
-    """Sections of a report, one for each table of the paper whose case has results.
+def compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, pd.DataFrame]]:
+    """Tables of the paper whose cases have results, with their rows as of ``compared``.
 
     Args:
         suite: results of suite ``paper``.
     """
-    sections: dict[str, list[Block]] = {}
-    for table, rows in _compared_tables(suite):
-        sections[f"Table {table.number}: {table.title}"] = [
-            Table(f"{_CAPTION}, site {table.site}", rows, PAPER_TITLES),
-            Text(finding(rows) + _UNITS),
-        ]
-    return sections
-
-
-def _compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, pd.DataFrame]]:
-    """Tables whose cases have results, and their rows."""
     import pandas as pd
 
     tables = []

@@ -81,16 +81,16 @@ class RayCluster(Executor):
         """
         ray = self._ray
         task = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS - 1)(_run)
-        held: dict[str, Any] = {}
+        references: dict[str, Any] = {}
         running: dict[Any, Job] = {}
         while not stop():
             for _ in range(2 * self.workers - len(running)):
                 job = next(jobs, None)
                 if job is None:
                     break
-                for name in job.inputs.keys() - held.keys():
-                    held[name] = ray.put(inputs[name])
-                contents = [held[name] for name in job.inputs]
+                for name in job.inputs.keys() - references.keys():
+                    references[name] = ray.put(inputs[name])
+                contents = [references[name] for name in job.inputs]
                 running[task.remote(job, sys.path, *contents)] = job
             if not running:
                 return

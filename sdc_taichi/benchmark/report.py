@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import numpy as np
 
@@ -17,19 +20,8 @@ from sdc_taichi.benchmark.leaderboard import (
     OUTAGES,
     Leaderboard,
     leaderboard,
-    row_samples,
 )
-from sdc_taichi.benchmark.paper import PAPER, paper_sections
-from sdc_taichi.benchmark.report_blocks import (
-    Block,
-    Items,
-    Picture,
-    Sections,
-    Table,
-    Text,
-    html_report,
-    markdown_report,
-)
+from sdc_taichi.benchmark.paper import PAPER, PAPER_TITLES, PAPER_UNITS, compared_tables
 from sdc_taichi.benchmark.suite_results import (
     ACHIEVED,
     BOUND,
@@ -40,16 +32,20 @@ from sdc_taichi.benchmark.suite_results import (
     SuiteResults,
     read_suites,
 )
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, printable
 from sdc_taichi.learning.evaluation import ALL, IDLE
+from sdc_taichi.learning.evaluation_table import column_samples, literal_markdown
+from sdc_taichi.learning.evaluation_table import markdown as _markdown
 from sdc_taichi.learning.statistics import performance_profile
 from sdc_taichi.viz.fleet_figures import MAX_RUNS, interval_plot, profile_plot
 from sdc_taichi.viz.plotting import new_figure
+from sdc_taichi.viz.report_html import html_page, names_text, picture_element
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
-_MOST_NAMED = 8
+_PAPER_CAPTION = "Our figures, carbon with 95 % intervals, beside those printed"
 _LEAST_SHARE_PCT = -100.0
 """Share of the achievable below which pictures leave out rows, to keep the others readable."""
 _THRESHOLDS_PCT = np.linspace(-25.0, 110.0, 136)
@@ -74,6 +70,22 @@ READING = (
 """How to read the tables of a report."""
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture, which Markdown leaves out."""
+
+    draw: Callable[[], Figure]
+    """Draws the picture."""
+    alt: str
+    """Text in place of the picture, for readers who cannot see it."""
+    caption: str
+    """Text below the picture."""
+
+
+Sections = Mapping[str, Sequence[str | Picture]]
+"""Blocks of Markdown and pictures of each section of a report, by its heading."""
+
+
 def write_report(
     folders: Sequence[Path], *, html: Path | None = None, markdown: Path | None = None
 ) -> tuple[str, ...]:
@@ -93,46 +105,100 @@ def write_report(
     """
     suites = read_suites(folders)
     title = "Benchmark" if len(suites) > 1 else suites[0].suite.title
-    sections = report_sections(suites)
     if markdown is not None:
-        _write(markdown, markdown_report(title, sections, markdown.parent))
+        _write(markdown, markdown_report(title, report_sections(suites, markdown.parent)))
     notes: tuple[str, ...] = ()
     if html is not None:
+        sections = report_sections(suites, html.parent)
         if lacking := _lacking_pictures():
             notes = (f"tables alone: {lacking}",)
-            sections = {"Without pictures": [Text(lacking, "note")]} | {
+            sections = {"Without pictures": [_note(lacking)]} | {
                 heading: [block for block in blocks if not isinstance(block, Picture)]
                 for heading, blocks in sections.items()
             }
         lead = f"Suites: {', '.join(suite.name for suite in suites)}"
-        _write(html, html_report(title, lead, sections, html.parent))
+        _write(html, html_report(title, lead, sections))
     return notes
 
 
-def report_sections(suites: Iterable[SuiteResults]) -> Sections:
+def markdown_report(title: str, sections: Sections) -> str:
+    """A report as Markdown, without its pictures.
+
+    Args:
+        title: heading of the report.
+        sections: its sections.
+    """
+    parts = [f"# {literal_markdown(title)}"]
+    for heading, blocks in sections.items():
+        parts.append(f"## {literal_markdown(heading)}")
+        parts += [block for block in blocks if isinstance(block, str)]
+    return "\n\n".join(parts) + "\n"
+
+
+def html_report(title: str, lead: str, sections: Sections) -> str:
+    """A report as one HTML page, which contains all that it shows and needs no network.
+
+    Args:
+        title: heading of the report.
+        lead: text below it.
+        sections: its sections.
+
+    Raises:
+        SdcError: jinja2 is missing, or there are pictures and matplotlib is missing.
+    """
+    from markdown_it import MarkdownIt
+
+    page = MarkdownIt("commonmark", {"html": False}).enable("table")
+    shown = {
+        heading: "".join(
+            page.render(block)
+            if isinstance(block, str)
+            else picture_element(block.draw(), block.alt, block.caption)
+            for block in blocks
+        )
+        for heading, blocks in sections.items()
+    }
+    return html_page(title, lead, shown, set())
+
+
+def report_sections(suites: Iterable[SuiteResults], folder: Path) -> Sections:
     """Sections of the report of suites.
 
     Args:
         suites: results of the suites.
+        folder: folder of the report; links are relative to it.
     """
-    sections: dict[str, Sequence[Block]] = {}
+    sections: dict[str, Sequence[str | Picture]] = {}
     for suite in suites:
         boards = {name: leaderboard(case) for name, case in suite.cases.items()}
         sections[f"Suite {suite.name}"] = _suite_blocks(suite, boards)
         if suite.suite.accounting == PAPER:
-            sections |= paper_sections(suite)
+            for table, rows in compared_tables(suite):
+                caption = f"{_PAPER_CAPTION}, site {table.site}"
+                heading = f"Table {table.number}: {table.title}"
+                sections[heading] = [_table(caption, rows, PAPER_TITLES), PAPER_UNITS]
         for name, board in boards.items():
-            sections[f"{suite.name}: {name}"] = _case_blocks(suite, board)
-    sections["How to read the tables"] = [Text(text) for text in READING]
+            sections[f"{suite.name}: {name}"] = _case_blocks(suite, board, folder)
+    sections["How to read the tables"] = list(READING)
     return sections
 
 
-def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
+def _note(text: str) -> str:
+    """A paragraph that stands out."""
+    return f"> {literal_markdown(text)}"
+
+
+def _table(caption: str, frame: pd.DataFrame, titles: Mapping[str, str] = BOARD_TITLES) -> str:
+    """A table with its caption and intervals in brackets after their values."""
+    return f"{literal_markdown(caption)}\n\n{_markdown(frame, titles)}"
+
+
+def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[str]:
     """Subject of a suite, the commands and time behind its results, and notes on them."""
-    blocks: list[Block] = [Text(suite.suite.about or suite.suite.title)]
-    blocks += [Text(text, "note") for text in suite_notes(suite)]
-    blocks += [Text(text, "command") for text in suite.commands]
-    blocks.append(Text(cost_text(suite)))
+    blocks = [literal_markdown(suite.suite.about or suite.suite.title)]
+    blocks += map(_note, suite_notes(suite))
+    blocks += [f"    {printable(' '.join(text.split()))}" for text in suite.commands]
+    blocks.append(cost_text(suite))
     if len(boards) > 1:
         blocks.append(_overview(boards))
     return blocks
@@ -155,7 +221,7 @@ def cost_text(suite: SuiteResults) -> str:
     )
 
 
-def _overview(boards: Mapping[str, Leaderboard]) -> Table:
+def _overview(boards: Mapping[str, Leaderboard]) -> str:
     """Change against idle commands of each row in each case."""
     import pandas as pd
 
@@ -164,7 +230,7 @@ def _overview(boards: Mapping[str, Leaderboard]) -> Table:
     }
     names = dict.fromkeys(name for board in boards.values() for name in board.case.rows)
     frame = pd.DataFrame(changes).reindex(list(names)).rename_axis("row").reset_index()
-    return Table("Change against idle commands by case (%)", frame, BOARD_TITLES)
+    return _table("Change against idle commands by case (%)", frame)
 
 
 def suite_notes(suite: SuiteResults) -> list[str]:
@@ -179,13 +245,13 @@ def suite_notes(suite: SuiteResults) -> list[str]:
         notes.append("Quick form, with few weeks and short trainings: no results of the suite.")
     missing = [f"{case.name}: {x}" for case in suite.cases.values() for x in case.missing]
     if missing:
-        notes.append(f"Unfinished, without {_named(missing)}.")
+        notes.append(f"Unfinished, without {names_text(missing)}.")
     for key, what in (("version", "versions of the package"), ("source", "states of the source")):
         values = [getattr(result.record, key)[:12] for result in results]
         counts = Counter(filter(None, values))  # submitted tables have none
         if len(counts) > 1:
             several = [f"{value} ({count})" for value, count in counts.items()]
-            notes.append(f"Results of several {what}: {_named(several)}.")
+            notes.append(f"Results of several {what}: {names_text(several)}.")
     if len({str(x.record.processor) for x in results if x.record.processor}) > 1:
         notes.append(
             "Results of several kinds of processors: their last bits differ, and so do the trained "
@@ -207,8 +273,8 @@ def _notes_of_case(case: CaseResults) -> list[str]:
     few = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) < FEWEST]
     if few:
         notes.append(
-            f"fewer than {FEWEST} seeds of {_named(few)}, so what another training would reach is "
-            "not known, and there is no place."
+            f"fewer than {FEWEST} seeds of {names_text(few)}, so what another training would reach "
+            "is not known, and there is no place."
         )
     results = case.results
     frame = results[0].frame
@@ -223,19 +289,13 @@ def _notes_of_case(case: CaseResults) -> list[str]:
     return notes
 
 
-def _named(names: Sequence[str]) -> str:
-    """The first few names, and how many more there are."""
-    some = ", ".join(names[:_MOST_NAMED])
-    return some if len(names) <= _MOST_NAMED else f"{some} and {len(names) - _MOST_NAMED} more"
-
-
-def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
-    """Tables and pictures of a case."""
+def _case_blocks(suite: SuiteResults, board: Leaderboard, folder: Path) -> list[str | Picture]:
+    """Tables and pictures of a case, with links relative to the folder of the report."""
     case = board.case
-    blocks: list[Block] = []
+    blocks: list[str | Picture] = []
     if about := case.settings.about:
-        blocks.append(Text(about))
-    blocks.append(Text(weeks_text(board)))
+        blocks.append(literal_markdown(about))
+    blocks.append(literal_markdown(weeks_text(board)))
     tables = [
         (f"Standings, {case.objective}; means of a week where no %", board.standings),
         ("Each row against the best rule, and against the row below", board.pairs),
@@ -248,24 +308,24 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     pictures = case_pictures(board)
     for caption, frame in tables:
         if not frame.empty:
-            blocks.append(Table(caption, frame, BOARD_TITLES))
+            blocks.append(_table(caption, frame))
             if frame is board.standings:
                 blocks += pictures
     if rows := _row_texts(suite, board):
-        blocks += [Text("Rows", "heading"), Items(dict.fromkeys(rows))]
-    if recordings := _recordings(case):
-        blocks += [Text("Recordings", "heading"), Items(recordings)]
+        blocks += ["### Rows", "\n".join(f"- {literal_markdown(text)}" for text in rows)]
+    if recordings := _recordings(case, folder):
+        blocks += ["### Recordings", "\n".join(recordings)]
     return blocks
 
 
-def _outage_notes(board: Leaderboard) -> list[Block]:
+def _outage_notes(board: Leaderboard) -> list[str]:
     """A note that places are by the objective alone, where work is lost or racks are off."""
     broken = [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]
     text = (
         f"Places are by {board.case.objective} alone. Racks that are off and work that is lost "
         f"draw no power: read the places beside {', '.join(broken)}."
     )
-    return [Text(text, "note")] if broken else []
+    return [_note(text)] if broken else []
 
 
 def weeks_text(board: Leaderboard) -> str:
@@ -279,7 +339,7 @@ def weeks_text(board: Leaderboard) -> str:
     objective = board.case.objective
     return (
         f"The objective is {objective} ({objective.unit}), in weeks "
-        f"{', '.join(map(str, weeks))} of {_named([str(site) for site in sites])}."
+        f"{', '.join(map(str, weeks))} of {names_text([str(site) for site in sites])}."
     )
 
 
@@ -296,15 +356,17 @@ def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
     return texts
 
 
-def _recordings(case: CaseResults) -> dict[str, Path | None]:
-    """Recordings of the results of a case, by their names."""
-    return {
-        f"{name}, seed {result.seed}: {file}": result.folder / file
-        for name, results in case.rows.items()
-        for result in results
-        for file in result.record.files_sha256
-        if file.endswith(".rrd")
-    }
+def _recordings(case: CaseResults, folder: Path) -> list[str]:
+    """Links to the recordings of the results of a case, relative to a folder."""
+    links = []
+    for name, results in case.rows.items():
+        for result in results:
+            for file in result.record.files_sha256:
+                if file.endswith(".rrd"):
+                    path = os.path.relpath((result.folder / file).resolve(), folder.resolve())
+                    text = literal_markdown(f"{name}, seed {result.seed}: {file}")
+                    links.append(f"- [{text}](<{quote(Path(path).as_posix())}>)")
+    return links
 
 
 def case_pictures(board: Leaderboard) -> list[Picture]:
@@ -376,7 +438,7 @@ def _chosen(board: Leaderboard) -> list[str]:
 
 def _profile_picture(board: Leaderboard) -> Picture:
     """Share of weeks above each share of the achievable."""
-    shares = row_samples(board.evaluation, "share")
+    shares = column_samples(board.evaluation, "share")
     shown = {
         name: performance_profile(100.0 * shares[name], _THRESHOLDS_PCT)
         for name in _chosen(board)

@@ -23,6 +23,7 @@ from sdc_taichi.atomic_file import FileClaim, atomic_write, naming_errors
 from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, digest_of, source_digest
 from sdc_taichi.config.fields import explain
 from sdc_taichi.errors import ConfigError, SdcError, shortened
+from sdc_taichi.learning.training_settings import leaves
 from sdc_taichi.user_file import MOST_METRICS_BYTES, list_folder, read_bytes, read_text
 
 if TYPE_CHECKING:
@@ -435,16 +436,8 @@ def write_record(path: Path, record: Record) -> None:
 
 def _flat_settings(study: Study) -> dict[str, Any]:
     """Kind, version and settings of a study by their dotted names."""
-
-    def flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-        for name, value in values.items():
-            if isinstance(value, Mapping) and value:
-                yield from flat(value, f"{prefix}{name}.")
-            else:
-                yield f"{prefix}{name}", value
-
     settings = study.model_dump(mode="json")["settings"]
-    return {"kind": study.kind, "version": study.version, **dict(flat(settings, ""))}
+    return {"kind": study.kind, "version": study.version, **dict(leaves("", settings))}
 
 
 def _setting_text(values: Mapping[str, Any], name: str) -> str:

@@ -16,6 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel
+
 from sdc_taichi.benchmark.cases import (
     agents_of,
     data_centers,
@@ -96,14 +98,7 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
         A row for each week, with the columns of ``learning.evaluation``; the policy and the curves
         of a training as files.
     """
-    task = _Task(
-        name=values["name"],
-        case=Case.model_validate(values["case"]),
-        row=Row.model_validate(values["row"]),
-        training=values["training"],
-        objective=values["objective"],
-        seed=values["seed"],
-    )
+    task = _Task.model_validate(values)
     with TemporaryDirectory() as scratch:
         optima = Path(scratch) / "optima"
         optima.mkdir()
@@ -132,9 +127,8 @@ def packed(files: Mapping[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """Arguments of a row job: a row of a case with one seed."""
+class _Task(BaseModel):
+    """Values of a row job: a row of a case with one seed."""
 
     name: str
     """Name of the row."""
@@ -142,7 +136,7 @@ class _Task:
     """Data centers and weeks."""
     row: Row
     """The row."""
-    training: Mapping[str, Any]
+    training: dict[str, Any]
     """Settings of every training of the suite."""
     objective: str
     """Objective that is compared."""

@@ -102,13 +102,13 @@ def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
         )
     if "." not in path:
         raise ConfigError(f"{where}: valid is a field of a section, such as site.location")
-    held = value_at(config, path)
+    default = value_at(config, path)
     ends = [_number(part) for part in listed.split("..")]
     if len(ends) == 2 and None not in ends:
-        return _range(path, listed, held, where)
+        return _range(path, listed, default, where)
     steps = listed.split(":")
     if len(steps) in (2, 3) and _number(steps[0]) is not None:
-        return Grid(path, _fractions(_steps(steps, most, where), held))
+        return Grid(path, _fractions(_steps(steps, most, where), default))
     try:
         values = load_yaml(f"[{listed}]")
         keys = [json.dumps(value, sort_keys=True, allow_nan=False) for value in values]
@@ -121,7 +121,7 @@ def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
         if key in seen:
             raise ConfigError(f"{where}: {shortened(value)} is given twice; valid is each once")
         seen.add(key)
-    return Grid(path, _fractions(values, held))
+    return Grid(path, _fractions(values, default))
 
 
 def value_at(config: DataCenterConfig, path: str) -> Any:
@@ -174,12 +174,12 @@ def value_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _range(path: str, ends: str, held: Any, where: str) -> Range:
+def _range(path: str, ends: str, default: Any, where: str) -> Range:
     """The range of a text ``LOW..HIGH``, both of which are numbers."""
     low, high = (parse_number(part) for part in ends.split(".."))
     if not low < high:
         raise ConfigError(f"{where}: the range is empty; valid is LOW..HIGH with LOW below HIGH")
-    is_whole = _is_number(held) and isinstance(held, int)
+    is_whole = _is_number(default) and isinstance(default, int)
     if is_whole and not (low.is_integer() and high.is_integer()):
         raise ConfigError(f"{where}: {path} is a whole number; valid are whole LOW and HIGH")
     return Range(path, low, high, is_whole)
@@ -215,9 +215,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _fractions(values: Sequence[Any], held: Any) -> tuple[Any, ...]:
+def _fractions(values: Sequence[Any], default: Any) -> tuple[Any, ...]:
     """Values as fractions if all are numbers, and one of them or what the field holds is one."""
-    is_fraction = any(isinstance(value, float) for value in (*values, held))
+    is_fraction = any(isinstance(value, float) for value in (*values, default))
     if is_fraction and all(map(_is_number, values)):
         return tuple(map(float, values))
     return tuple(values)

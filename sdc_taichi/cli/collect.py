@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import sys
@@ -174,12 +175,12 @@ def _print_summary(made: DataSet) -> None:
     """Say what a data set holds and where it is."""
     from sdc_taichi.benchmark.offline import CARD_FILE
 
-    for each in made.controllers:
-        score = made.score(each.mean_return)
-        text = "" if score is None else f", score {100.0 * score:.1f} %"
+    for name in made.collection.controllers:
+        row, score = made.returns.loc[name], made.score(name)
+        text = "" if math.isnan(score) else f", score {100.0 * score:.1f} %"
         print(
-            f"{each.controller}: {each.episodes:,} episodes, {each.steps:,} steps, mean return "
-            f"{each.mean_return:.2f}{text}"
+            f"{name}: {int(row['episodes']):,} episodes, {int(row['steps']):,} steps, mean return "
+            f"{row['mean_return']:.2f}{text}"
         )
     folder = printable(made.folder)
     print(f"{made.id} in {folder}; {CARD_FILE} there tells what it holds and how to load it")

@@ -16,8 +16,8 @@ import torch
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.algorithms import CrossEntropySettings
-from sdc_taichi.learning.networks import CLIP, LEAST_STD
-from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
+from sdc_taichi.learning.networks import CLIP, LEAST_STD, policy_network
+from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.types import F32, F64, I64
 
@@ -120,18 +120,9 @@ class CrossEntropySearch:
         networks = []
         for name, of in self._spaces.items():
             search = self._searches[name]
-            networks.append(
-                PolicyNetwork(
-                    agents=of.agents,
-                    mean=search.seen_mean.astype(np.float32),
-                    std=search.seen_std.astype(np.float32),
-                    clip=CLIP,
-                    layers=((_f32(search.mean[:, :-1]), _f32(search.mean[:, -1])),),
-                    activation="tanh",
-                    head="clip" if of.choices is None else "argmax",
-                    choices=of.choices or CHOICES,
-                )
-            )
+            layers = ((_f32(search.mean[:, :-1]), _f32(search.mean[:, -1])),)
+            seen = _f32(search.seen_mean), _f32(search.seen_std)
+            networks.append(policy_network(layers, *seen, of))
         return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:

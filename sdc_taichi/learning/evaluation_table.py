@@ -175,6 +175,16 @@ def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F6
     }
 
 
+def column_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
+    """Values of a column for each controller that gave all its commands, (S, W) each.
+
+    Args:
+        evaluation: the evaluation.
+        column: column of its rows.
+    """
+    return {name: _sample(rows, column) for name, rows in _groups(evaluation, ALL)}
+
+
 def text_rows(
     table: pd.DataFrame, titles: Mapping[str, str] = TITLES
 ) -> tuple[list[str], list[list[str]]]:
@@ -209,7 +219,7 @@ def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
     heads, rows = text_rows(table, titles)
     lines = [" | ".join(map(literal_markdown, cells)) for cells in (heads, *rows)]
     lines = [f"| {line} |" for line in lines]
-    return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
+    return "\n".join([lines[0], "|---" + "|---:" * (len(heads) - 1) + "|", *lines[1:]])
 
 
 def literal_markdown(text: str) -> str:
@@ -266,7 +276,7 @@ def _interval(
     generator = np.random.Generator(np.random.PCG64(_SEED))
     paired = len(_base(evaluation.rows)) > 1
     interval = bootstrap_interval(statistic, samples, evaluation.strata, generator, paired=paired)
-    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return interval.columns(name)
 
 
 def _column(evaluation: Evaluation) -> str:

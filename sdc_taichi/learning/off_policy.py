@@ -31,9 +31,15 @@ import torch
 from torch import Tensor
 
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.action_values import ContinuousValues, JointValues
 from sdc_taichi.learning.algorithms import OffPolicyDefinition, OffPolicySettings
-from sdc_taichi.learning.networks import CLIP, RunningMoments, generators, layers_of
+from sdc_taichi.learning.networks import (
+    ContinuousValues,
+    JointValues,
+    RunningMoments,
+    generators,
+    layers_of,
+    policy_network,
+)
 from sdc_taichi.learning.off_policy_actors import (
     GaussianActors,
     GreedyActors,
@@ -42,7 +48,7 @@ from sdc_taichi.learning.off_policy_actors import (
     adam,
     descend,
 )
-from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
+from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
 STATE = "state"
@@ -128,18 +134,10 @@ class OffPolicy:
         for name, of in self._spaces.items():
             *inner, (weight, bias) = layers_of(self._actors.nets[name])
             outputs = of.action_width * (of.choices or 1)
-            networks.append(
-                PolicyNetwork(
-                    agents=of.agents,
-                    mean=mean[columns[name]].copy(),
-                    std=std[columns[name]].copy(),
-                    clip=CLIP,
-                    layers=(*inner, (weight[:outputs], bias[:outputs])),
-                    activation=self._settings.activation,
-                    head=self._actors.head,
-                    choices=of.choices or CHOICES,
-                )
-            )
+            layers = (*inner, (weight[:outputs], bias[:outputs]))
+            of_learner = mean[columns[name]], std[columns[name]]
+            activation = self._settings.activation
+            networks.append(policy_network(layers, *of_learner, of, activation, "tanh"))
         return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:

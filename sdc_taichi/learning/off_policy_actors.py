@@ -9,14 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from sdc_taichi.learning.action_values import ContinuousValues, JointValues, expected
 from sdc_taichi.learning.algorithms import OffPolicySettings
-from sdc_taichi.learning.networks import LAST_GAIN, perceptron
+from sdc_taichi.learning.networks import (
+    LAST_GAIN,
+    ContinuousValues,
+    JointValues,
+    expected,
+    perceptron,
+)
 from sdc_taichi.learning.stream import LearnerSpaces
 
 LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
@@ -51,10 +56,7 @@ class Actors(Generic[Values]):
         nets: network of each learner.
         adams: optimiser of each learner's network.
         numbers: columns of each learner's numbers.
-        head: head of the policies' networks, as in ``PolicyNetwork``.
     """
-
-    head: Literal["argmax", "tanh"] = "argmax"
 
     def __init__(
         self,
@@ -187,31 +189,50 @@ class EntropicActors(Actors[Values]):
         generator: torch.Generator,
     ) -> None:
         super().__init__(critic, spaces, settings, generator)
-        targets = {}
+        self._wanted_entropies: dict[str, float] = {}
         for name, of in spaces.items():
             of_number = settings.continuous_entropy
             if of.choices is not None:
                 of_number = settings.entropy_share * math.log(of.choices)
-            targets[name] = of_number * of.action_width
-        self._temperatures = Temperatures(targets, settings)
+            self._wanted_entropies[name] = of_number * of.action_width
+        start = math.log(settings.temperature)
+        self._log_temperatures = {name: torch.tensor(start, requires_grad=True) for name in spaces}
+        self._temperature_adams = {
+            name: adam([log], settings.temperature_rate)
+            for name, log in self._log_temperatures.items()
+        }
+
+    def temperature(self, name: str) -> Tensor:
+        """Temperature of a learner, ()."""
+        return self._log_temperatures[name].detach().exp()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that ``load_state_dict`` needs."""
-        return super().state_dict() | {"temperatures": self._temperatures.state_dict()}
+        temperatures = {
+            name: {"log": log.detach(), "adam": self._temperature_adams[name].state_dict()}
+            for name, log in self._log_temperatures.items()
+        }
+        return super().state_dict() | {"temperatures": temperatures}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """Restore the state that ``state_dict`` returned."""
         super().load_state_dict(values)
-        self._temperatures.load_state_dict(values["temperatures"])
+        for name, log in self._log_temperatures.items():
+            of = values["temperatures"][name]
+            with torch.no_grad():
+                log.copy_(torch.as_tensor(of["log"]))
+            self._temperature_adams[name].load_state_dict(of["adam"])
 
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
         """Update the network and the temperature of a learner, and return numbers to log."""
         self._descend(loss, name)
-        self._temperatures.follow(name, entropy)
+        log = self._log_temperatures[name]
+        excess = log * (entropy - self._wanted_entropies[name])
+        descend(excess, [log], self._temperature_adams[name], math.inf)
         return {
             f"policy_loss/{name}": loss.detach(),
             f"entropy/{name}": entropy,
-            f"temperature/{name}": self._temperatures.of(name),
+            f"temperature/{name}": self.temperature(name),
         }
 
 
@@ -235,7 +256,7 @@ class SoftActors(EntropicActors[JointValues]):
         log_p = self._choice_outputs(after).log_softmax(-1)
         value = expected(self._critic(after.state, targets).amin(0), log_p.exp()).squeeze(-1)
         return value + sum(
-            self._temperatures.of(name) * entropies(log_p[:, numbers])
+            self.temperature(name) * entropies(log_p[:, numbers])
             for name, numbers in self.numbers.items()
         )
 
@@ -250,7 +271,7 @@ class SoftActors(EntropicActors[JointValues]):
             numbers = self.numbers[name]
             free = range(*numbers.indices(probabilities.shape[1]))
             values = expected(table, probabilities, free)
-            loss = soft_policy_loss(log_p[name], values, self._temperatures.of(name))
+            loss = soft_policy_loss(log_p[name], values, self.temperature(name))
             logged |= self._step(name, loss, entropies(log_p[name].detach()).mean())
             with torch.no_grad():
                 probabilities[:, numbers] = self._log_p(name, situation).exp()
@@ -269,8 +290,6 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     the critic reach the policy through the action.
     """
 
-    head = "tanh"
-
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
         """Actions drawn from the policies, (N, K)."""
         return self._draw_all(situation, generator)[0]
@@ -281,7 +300,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
         """Soft values of drawn actions by the target critic, (N,)."""
         actions, log_p = self._draw_all(after, generator)
         value = self._critic.of_actions(after.state, actions, targets).amin(0)
-        return value - sum(self._temperatures.of(name) * log_p[name] for name in self.nets)
+        return value - sum(self.temperature(name) * log_p[name] for name in self.nets)
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Raise the soft value by one learner after another, and return losses and entropies."""
@@ -293,7 +312,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
             part, log_p = drawn[name]
             joint = torch.cat([actions[:, : numbers.start], part, actions[:, numbers.stop :]], 1)
             value = self._critic.of_actions(situation.state, joint).amin(0)
-            loss = (self._temperatures.of(name) * log_p - value).mean()
+            loss = (self.temperature(name) * log_p - value).mean()
             logged |= self._step(name, loss, -log_p.detach().mean())
             with torch.no_grad():
                 actions[:, numbers] = self._draw(name, situation, generator)[0]
@@ -315,46 +334,6 @@ class GaussianActors(EntropicActors[ContinuousValues]):
         log_std = log_std.clamp(LEAST_LOG_STD, MOST_LOG_STD)
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
         return squashed(mean, log_std, noise)
-
-
-class Temperatures:
-    """Weight of the entropy of each learner, adjusted until the entropy equals a target.
-
-    Args:
-        targets: target entropy of each learner, nats.
-        settings: settings of the algorithm.
-    """
-
-    def __init__(self, targets: Mapping[str, float], settings: OffPolicySettings) -> None:
-        self._targets = dict(targets)
-        start = math.log(settings.temperature)
-        self._logs = {name: torch.tensor(start, requires_grad=True) for name in targets}
-        self._adam = {
-            name: adam([log], settings.temperature_rate) for name, log in self._logs.items()
-        }
-
-    def of(self, name: str) -> Tensor:
-        """Temperature of a learner, ()."""
-        return self._logs[name].detach().exp()
-
-    def follow(self, name: str, entropy: Tensor) -> None:
-        """Raise the temperature of a learner whose entropy is below its target, or lower it."""
-        loss = self._logs[name] * (entropy - self._targets[name])
-        descend(loss, [self._logs[name]], self._adam[name], math.inf)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that ``load_state_dict`` needs."""
-        return {
-            name: {"log": log.detach(), "adam": self._adam[name].state_dict()}
-            for name, log in self._logs.items()
-        }
-
-    def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore the state that ``state_dict`` returned."""
-        for name, log in self._logs.items():
-            with torch.no_grad():
-                log.copy_(torch.as_tensor(values[name]["log"]))
-            self._adam[name].load_state_dict(values[name]["adam"])
 
 
 def adam(parameters: Any, rate: float) -> torch.optim.Adam:

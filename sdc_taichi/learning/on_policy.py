@@ -29,6 +29,7 @@ from sdc_taichi.learning.networks import (
     Actor,
     RunningMoments,
     generators,
+    layers_of,
     perceptron,
     policy_network,
 )
@@ -126,7 +127,13 @@ class OnPolicy:
         """The current policies."""
         activation = self._settings.activation
         return tuple(
-            policy_network(self._actors[name].net, self._moments[name], of, activation)
+            policy_network(
+                layers_of(self._actors[name].net),
+                self._moments[name].mean.float().numpy(),
+                self._moments[name].std.numpy(),
+                of,
+                activation,
+            )
             for name, of in self._spaces.items()
         )
 

@@ -31,6 +31,14 @@ class Interval(NamedTuple):
     high: float
     """Upper end of the interval, in the unit of the statistic."""
 
+    def columns(self, name: str) -> dict[str, float]:
+        """Columns of a table with the value and both ends.
+
+        Args:
+            name: column of the value; those of the ends are ``NAME_low`` and ``NAME_high``.
+        """
+        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
+
 
 Statistic = Callable[..., F64]
 """Function of samples, (..., S, W) each, that returns a number for each of the leading axes."""

@@ -118,8 +118,7 @@ class CsvLog:
     def __init__(self, path: Path, until: int) -> None:
         self._path = path
         self._columns: list[str] = []
-        rows = self._read()
-        rows = [row for row in rows if _is_complete(row, self._columns) and int(row[0]) <= until]
+        rows = [row for row in self._read() if int(row[UPDATE]) <= until]
         if rows:
             self._write(rows)
         else:
@@ -133,31 +132,33 @@ class CsvLog:
         Raises:
             SdcError: the file cannot be written.
         """
-        new = [name for name in row if name not in self._columns]
-        if new:
+        if new := [name for name in row if name not in self._columns]:
             rows = self._read()
             self._columns += new
             self._write(rows)
         with naming_errors(self._path), self._path.open("ab") as file:
-            file.write(_line([row.get(name, "") for name in self._columns]))
+            file.write(self._text([row]))
 
-    def _read(self) -> list[list[str]]:
-        """Rows of the file; also sets the columns."""
+    def _read(self) -> list[dict[str, str]]:
+        """Complete rows of the file; also sets the columns."""
         if not self._path.exists():
             return []
         with naming_errors(self._path):
             text = self._path.read_text(encoding="utf-8", errors="replace")
-        rows = list(csv.reader(text.splitlines()))
-        self._columns = rows[0] if rows else []
         # The last row is incomplete if the process was killed while it wrote the row.
-        return rows[1:] if text.endswith("\n") else rows[1:-1]
+        reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
+        rows = [row for row in reader if None not in (*row, *row.values())]
+        self._columns = list(reader.fieldnames or ())
+        return [row for row in rows if row.get(UPDATE, "").isdecimal()]
 
-    def _write(self, rows: Sequence[Sequence[str]]) -> None:
-        width = len(self._columns)
+    def _write(self, rows: Sequence[Mapping[str, Any]]) -> None:
         with atomic_write(self._path) as file:
-            file.write(_line(self._columns))
-            for row in rows:
-                file.write(_line([*row, *[""] * (width - len(row))]))
+            file.write(self._text([dict(zip(self._columns, self._columns, strict=True)), *rows]))
+
+    def _text(self, rows: Sequence[Mapping[str, Any]]) -> bytes:
+        out = io.StringIO()
+        csv.DictWriter(out, self._columns, restval="", lineterminator="\n").writerows(rows)
+        return out.getvalue().encode()
 
 
 class EventLog:
@@ -223,16 +224,6 @@ class EventLog:
         if self._writer is not None:
             with naming_errors(self._folder):
                 self._writer.close()
-
-
-def _is_complete(row: Sequence[str], columns: Sequence[str]) -> bool:
-    return len(row) == len(columns) and columns[0] == UPDATE and row[0].isdecimal()
-
-
-def _line(values: Sequence[Any]) -> bytes:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerow(values)
-    return out.getvalue().encode()
 
 
 FORMAT = "sdc-taichi state"

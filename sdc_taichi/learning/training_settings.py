@@ -324,10 +324,10 @@ class TrainingSettings(Section):
 
     def _config(self) -> DataCenterConfig:
         """The data center, with its overrides, before sites and weeks."""
-        leaves = dict(_leaves("", self.overrides))
+        overrides = dict(leaves("", self.overrides))
         if isinstance(self.config, str):
-            return load_config(self.config, [f"{k}={json.dumps(v)}" for k, v in leaves.items()])
-        return with_values(config_from_dict(self.config), leaves)
+            return load_config(self.config, [f"{k}={json.dumps(v)}" for k, v in overrides.items()])
+        return with_values(config_from_dict(self.config), overrides)
 
     def data_centers_of_weeks(self) -> list[DataCenterConfig]:
         """Data centers to train in: one for each site and week, site by site.
@@ -357,9 +357,9 @@ class TrainingSettings(Section):
         Args:
             other: settings to compare with.
         """
-        mine, theirs = (dict(_leaves("", s.model_dump(mode="json"))) for s in (self, other))
-        for name in [*mine, *theirs]:
-            one, two = mine.get(name), theirs.get(name)
+        ours, others = (dict(leaves("", s.model_dump(mode="json"))) for s in (self, other))
+        for name in [*ours, *others]:
+            one, two = ours.get(name), others.get(name)
             is_section = {} in (one, two)
             if name != "steps" and one != two and not is_section:
                 return f"{name}: {shortened(one)}, not {shortened(two)}"
@@ -454,11 +454,16 @@ def _set_options(options: EnvOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in options.model_fields_set}
 
 
-def _leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Values that are no sections, by their dotted paths."""
+def leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Values that are no sections, by their dotted paths.
+
+    Args:
+        path: dotted path of the values; empty at the top.
+        values: the values.
+    """
     for key, value in values.items():
         name = f"{path}.{key}".lstrip(".")
         if isinstance(value, Mapping) and value:
-            yield from _leaves(name, value)
+            yield from leaves(name, value)
         else:
             yield name, value
