@@ -21,6 +21,7 @@ from learning_games import (  # noqa: E402
     chosen,
     weights,
 )
+from sdc_taichi.errors import ConfigError  # noqa: E402
 from sdc_taichi.learning.algorithms import (  # noqa: E402
     OFF_POLICY,
     ON_POLICY,
@@ -66,7 +67,7 @@ def trained(name: str, game: Game, updates: int, **changes: Any) -> Any:
     [
         (("ippo", "mappo", "happo", "haa2c"), Meeting(3), [0, 1, 2]),
         (("had3qn", "hasac"), Coordination(2), [0, 0]),
-        (("ppo", "had3qn", "hasac"), Meeting(1, width=3), [0, 1, 2]),
+        (("ppo", "had3qn", "hasac", "cross-entropy"), Meeting(1, width=3), [0, 1, 2]),
         (("ppo", "happo", "had3qn", "hasac"), Patience(1), [2]),
     ],
     ids=["meeting", "coordination", "several choices of one player", "patience"],
@@ -80,7 +81,12 @@ def test_players_find_the_best_choices(names: tuple[str, ...], game: Game, best:
 
 @pytest.mark.parametrize(
     ("name", "updates", "changes"),
-    [("ippo", 80, {"anneal": True}), ("happo", 80, {"anneal": True}), ("hasac", 100, {})],
+    [
+        ("ippo", 80, {"anneal": True}),
+        ("happo", 80, {"anneal": True}),
+        ("hasac", 100, {}),
+        ("cross-entropy", 40, {}),
+    ],
 )
 def test_players_find_the_best_numbers(name: str, updates: int, changes: dict[str, Any]) -> None:
     learner = trained(name, Aim(2, discrete=False), updates, **changes)
@@ -104,3 +110,8 @@ def test_training_continues_from_its_state_to_the_same_bits(name: str, discrete:
     later.load_state_dict(room)
     assert [other.update(later) for _ in range(2)] == numbers
     assert_same_bits(other, whole)
+
+
+def test_search_needs_a_data_center_for_each_candidate() -> None:
+    with pytest.raises(ConfigError, match=r"learning\.candidates 65: there are 32 data centers"):
+        algorithm("cross-entropy", Meeting(1), 1, candidates=65)

@@ -21,9 +21,8 @@ from sdc_taichi.control import ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
-from sdc_taichi.learning.training_settings import merged
+from sdc_taichi.learning.training_settings import merged, read_values
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 REFERENCE = "reference"
 """Beginning of the names of jobs that solve for optima, which no row may have."""
@@ -307,22 +306,16 @@ def load_suite(source: str, *, quick: bool = False) -> Suite:
     if source in suite_names():
         label, name = f"suite {source}", source
         folder = resources.files("sdc_taichi.configs").joinpath("suites")
-        text = folder.joinpath(f"{source}.yaml").read_text("utf-8")
+        values = load_yaml(folder.joinpath(f"{source}.yaml").read_text("utf-8"))
     else:
         label, name = source, Path(source).stem
         try:
-            text = read_text(source, MOST_CONFIG_BYTES, ConfigError)
+            values = read_values(source)
         except ConfigError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
             meant = suggestion_or_valid(source, suite_names())
             raise ConfigError(f"{source}: no such suite or file{meant}") from None
-    try:
-        values = load_yaml(text)
-    except ValueError as error:
-        raise ConfigError(f"{label}: not valid YAML ({error})") from None
-    if not isinstance(values, dict):
-        raise ConfigError(f"{label}: the top level is a {type(values).__name__}; valid is a suite")
     values = {"name": name} | values
     if quick:
         make_suite(values, label)
