@@ -17,7 +17,7 @@ from sdc_taichi.benchmark.offline import data_set_folder, require_minari
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.solve import solve
-from sdc_taichi.types import Actions, BatteryAction, CoolAction, LoadAction
+from sdc_taichi.types import Actions
 from test_envs_commands import CONTROLLED, RACKS
 
 RULES = "load=greedy-ci,cooling=g36,battery=lookahead-24h"
@@ -183,21 +183,3 @@ def test_actions_of_decoded_commands_are_the_actions(actions: str) -> None:
         commands = Actions(**core._decoder.decode(actions_of_agents, core.view.state))
         for agent, decoded in core.actions_of(commands).items():
             np.testing.assert_allclose(decoded, actions_of_agents[agent], rtol=1e-12)
-
-
-def test_named_commands_and_those_between_choices_are_the_nearest_actions() -> None:
-    env = sdc_taichi.vector_env(2, "tiny", days=1)
-    env.reset(seed=0)
-    named = Actions(LoadAction.DEFER, CoolAction.RAISE, BatteryAction.CHARGE)
-    assert {a: x.tolist() for a, x in env.core.actions_of(named).items()} == {
-        "agent_ls": [0, 0],
-        "agent_dc": [2, 2],
-        "agent_bat": [0, 0],
-    }
-    between = Actions(load=np.array([0.4, 0.6]), battery=np.array([-0.4, -0.6]))
-    assert {a: x.tolist() for a, x in env.core.actions_of(between).items()} == {
-        "agent_ls": [1, 2],
-        "agent_dc": [1, 1],
-        "agent_bat": [1, 2],
-    }
-    env.close()

@@ -107,14 +107,6 @@ def test_ends_are_valued(found: Evaluation, weeks: DataCenterWeeks) -> None:
     np.testing.assert_allclose(taken, KWH_VALUE * gained, rtol=1e-6, atol=1e-9)
 
 
-def test_one_agent_alone_leaves_the_others_idle(found: Evaluation) -> None:
-    of = found.rows.groupby(["controller", "moves"])
-    idle, alone = of.get_group(("idle", ALL)), of.get_group(("rules", "battery"))
-    assert alone["it_kwh"].tolist() == idle["it_kwh"].tolist()
-    assert alone["hvac_kwh"].tolist() == idle["hvac_kwh"].tolist()
-    assert (alone["battery_throughput_kwh"] > 0).all()
-
-
 def test_validation_is_the_evaluation_of_all_weeks_together(
     found: Evaluation, weeks: DataCenterWeeks
 ) -> None:

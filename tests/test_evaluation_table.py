@@ -105,13 +105,6 @@ def test_differences_are_paired(found: Evaluation) -> None:
     assert table["g36"]["points_low"] < -3.0 < table["g36"]["points_high"]
 
 
-def test_markdown_has_intervals_in_brackets(found: Evaluation) -> None:
-    lines = markdown(differences(found, "g36")).splitlines()
-    assert lines[0].startswith("| controller | than | difference (points) |")
-    assert lines[2] == "| g36 | idle | -2.00 | 1.000 |"
-    assert lines[3].startswith("| g36 | ippo | 3.00 (")
-
-
 def test_of_a_bound_its_figure_alone_is_known(found: Evaluation) -> None:
     is_bound = found.rows["controller"] == "g36"
     rows = found.rows.assign(cfp_kg=found.rows["cfp_kg"].mask(is_bound))

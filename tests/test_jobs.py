@@ -257,21 +257,6 @@ def test_a_study_is_begun_once_and_continued_with_its_settings(tmp_path: Path) -
     assert store.study().command == "b"
 
 
-def test_results_of_other_source_files_are_kept_with_a_note(tmp_path: Path) -> None:
-    store = ResultStore(tmp_path)
-    run(draws(1), tmp_path)
-    content = json.loads((tmp_path / "study.json").read_text())
-    for name, value in (("source", "0" * 64), ("version", "0.0.1")):
-        (tmp_path / "study.json").write_text(json.dumps(content | {name: value}))
-        if name == "source":
-            with store.claimed(STUDY, resume=True) as notes:
-                assert "other source files" in notes[0]
-                assert run_jobs(draws(1), store, Executor()).kept == 1
-        else:
-            with pytest.raises(ConfigError, match=r"version '0\.0\.1', here"):
-                store.claimed(STUDY, resume=True).__enter__()
-
-
 def test_folders_that_are_not_free_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out, said in (

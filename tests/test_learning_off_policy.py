@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
@@ -20,12 +19,10 @@ from sdc_taichi.learning.networks import ContinuousValues, JointValues, expected
 from sdc_taichi.learning.off_policy import (  # noqa: E402
     OffPolicy,
     Replay,
-    critic_loss,
 )
 from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
     GaussianActors,
     best_replies,
-    soft_policy_loss,
     squashed,
 )
 
@@ -40,42 +37,6 @@ def normal(*shape: int, seed: int = 0, requires_grad: bool = False) -> Tensor:
     return values.requires_grad_(requires_grad)
 
 
-def test_gradients_of_losses_agree_with_finite_differences() -> None:
-    values, table = normal(5, 9), normal(5, 27)
-    temperature = torch.tensor(0.3, dtype=torch.float64)
-
-    def policy(scores: Tensor) -> Tensor:
-        return soft_policy_loss(scores.log_softmax(-1), values, temperature)
-
-    def squashed_policy(mean: Tensor, log_std: Tensor) -> Tensor:
-        actions, log_p = squashed(mean, log_std, normal(5, 2, seed=3))
-        return (0.3 * log_p + actions.square().sum(-1)).mean()
-
-    check = torch.autograd.gradcheck
-    assert check(policy, (normal(5, 2, 3, seed=1, requires_grad=True),))
-    assert check(critic_loss, (normal(2, 5, seed=1, requires_grad=True), normal(5, seed=2)))
-    assert check(
-        squashed_policy,
-        (normal(5, 2, seed=1, requires_grad=True), normal(5, 2, seed=2, requires_grad=True)),
-    )
-    assert check(lambda p: expected(table, p, {1}), (normal(5, 3, 3, requires_grad=True),))
-
-
-@pytest.mark.parametrize("activation", ["tanh", "relu"])
-def test_gradient_of_a_critic_agrees_with_finite_differences(
-    activation: Literal["tanh", "relu"],
-) -> None:
-    settings = OffPolicySettings(hidden=(4,), activation=activation)
-    critic = JointValues(2, 3, 2, settings, torch.Generator().manual_seed(0))
-    state, actions, targets = normal(6, 3), torch.tensor([[0, 1], [2, 2]]).repeat(3, 1), normal(6)
-
-    def loss(*parameters: Tensor) -> Tensor:
-        return critic_loss(critic.of_actions(state, actions, parameters), targets)
-
-    own = tuple(p.detach().double().requires_grad_() for p in critic.parameters)
-    assert torch.autograd.gradcheck(loss, own)
-
-
 def test_a_dueling_table_has_every_joint_action_in_the_order_of_its_choices() -> None:
     critic = JointValues(1, 2, 3, SMALL, torch.Generator().manual_seed(0))
     state = torch.randn(1, 2, generator=torch.Generator().manual_seed(1))
@@ -83,16 +44,6 @@ def test_a_dueling_table_has_every_joint_action_in_the_order_of_its_choices() ->
     for i, choices in enumerate(itertools.product(range(3), repeat=3)):
         assert critic.of_actions(state, torch.tensor([choices]))[0, 0] == table[i]
     assert len(table.unique()) == 27
-
-
-def test_the_expected_value_is_that_of_sampled_choices() -> None:
-    generator = torch.Generator().manual_seed(0)
-    table = torch.randn(1, 27, generator=generator)
-    probabilities = torch.rand(1, 3, 3, generator=generator).softmax(-1)
-    drawn = torch.multinomial(probabilities[0], 40_000, replacement=True, generator=generator)
-    sampled = table[0, (drawn * torch.tensor([[9], [3], [1]])).sum(0)]
-    error = sampled.std() / math.sqrt(len(sampled))
-    assert abs(expected(table, probabilities)[0, 0] - sampled.mean()) < 4 * error
 
 
 def test_the_expected_value_of_open_choices_is_that_of_each_of_them() -> None:

@@ -84,27 +84,6 @@ def samples(actor: Actor, rows: int = 12) -> tuple[Tensor, Tensor]:
         return seen, actor.sample(seen, generator)[0]
 
 
-@pytest.mark.parametrize("clip", [None, 0.2])
-@pytest.mark.parametrize("discrete", [True, False])
-def test_gradient_of_policy_loss_is_that_of_finite_differences(
-    discrete: bool, clip: float | None
-) -> None:
-    actor = actor_in_f64(discrete=discrete)
-    seen, actions = samples(actor)
-    generator = torch.Generator().manual_seed(3)
-    shift = torch.linspace(-0.6, 0.6, len(seen), dtype=torch.float64)
-    with torch.no_grad():
-        old_log_p = actor.evaluate(seen, actions)[0] + shift
-    advantages = torch.randn(len(seen), generator=generator, dtype=torch.float64)
-    by_others = torch.rand(len(seen), generator=generator, dtype=torch.float64) + 0.5
-
-    def loss() -> Tensor:
-        log_p, entropy = actor.evaluate(seen, actions)
-        return policy_loss((log_p - old_log_p).exp(), advantages * by_others, clip) - 0.1 * entropy
-
-    assert torch.autograd.gradcheck(lambda *_: loss(), tuple(actor.parameters()))
-
-
 def test_tanh_and_its_gradient() -> None:
     x = torch.linspace(-12.0, 12.0, 1001)
     torch.testing.assert_close(Tanh()(x), x.tanh(), atol=5e-7, rtol=0)

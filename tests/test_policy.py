@@ -77,12 +77,10 @@ def test_a_network_of_several_agents_reads_each_feature_once() -> None:
     [
         ({"std": np.zeros(13)}, r"std \(13,\) of mean \(13,\); valid is above 0"),
         ({"mean": np.full(13, np.nan)}, "mean has nan; valid is finite"),
-        ({"mean": np.zeros(12)}, r"std \(13,\) of mean \(12,\)"),
         (
             {"layers": ((np.zeros((6, 12)), np.zeros(6)),)},
             r"\(6, 12\).*valid is \(out, 13\)",
         ),
-        ({"layers": ((np.zeros((4, 13)), np.zeros(4)),)}, "4 outputs; valid is a multiple of 3"),
     ],
 )
 def test_networks_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
@@ -96,7 +94,6 @@ def test_networks_that_do_not_fit_the_interface_are_refused() -> None:
     for net, message in (
         (network(("agent_ls",), n, 3), "networks of agent_ls; valid is one for each of agent_bat"),
         (network(("agent_bat",), n + 1, 3), f"{n + 1} inputs; observations have {n}"),
-        (network(("agent_bat",), n, 6), "decides 2 numbers; its agents decide 1"),
         (
             network(("agent_bat",), n, 1, "clip"),
             "head clip of 3; valid for discrete actions is argmax of 3",
@@ -204,10 +201,12 @@ def test_the_difference_between_interfaces_is_named() -> None:
         (two_units, "CRAC units (hvac.crac.units): 1 in training, 2 here"),
         (
             interface(features={"agent_bat": ("soc",)}),
-            "observation of agent_bat: feature 'time_of_day' of the training is missing here",
+            "observation of agent_bat: feature 'time_of_day' (",
         ),
-        (with_soc(high=2.0), "'soc' is 0..1 share in training, 0..2 share here"),
-        (with_soc(size=2), "'soc' has 1 entries in training, 2 here"),
+        (with_soc(high=2.0), "in training, feature 'soc' (1 of 0..2 share) here"),
+            with_soc(high=2.0),
+            "'soc' (1 of 0..1 share) in training, feature 'soc' (1 of 0..2 share)",
+        ),
     ):
         assert said in str(base.difference(other))
 

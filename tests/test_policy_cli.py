@@ -65,22 +65,6 @@ def test_what_a_policy_is_shown_to_be(folder: Path) -> None:
     assert as_json.stdout == (folder / "best" / "policy.json").read_text()
 
 
-def test_what_is_not_valid_is_one_line(folder: Path, tmp_path: Path) -> None:
-    for arguments, said in (
-        (("policy", "show", tmp_path), "holds no policy"),
-        (("policy", "export", folder, "--out", "x.pt"), "valid is a name that ends in .onnx"),
-        (("simulate", "tiny", "--controller", f"policy:{tmp_path}"), "holds no policy"),
-        (
-            ("optimum", "tiny", "--agents", "battery", "--controller", f"policy:{folder}"),
-            "moves load and cooling, which --agents battery leaves idle",
-        ),
-    ):
-        done = call(*arguments)
-        assert done.exit_code == 2
-        assert said in done.stderr
-        assert len(done.stderr.splitlines()) == 1
-
-
 def test_a_controller_of_the_current_folder(tmp_path: Path) -> None:
     (tmp_path / "my_rules.py").write_text(RULES)
     name = "my_rules:Charge"

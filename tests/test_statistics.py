@@ -80,17 +80,6 @@ def test_trainings_are_drawn_whole() -> None:
     assert (found.high - found.low) / 2 == pytest.approx(1.96 * spread, rel=0.15)
 
 
-def test_weeks_are_paired() -> None:
-    weeks = 100.0 * generator().normal(size=(1, 60)) + 1e4
-    found = bootstrap_interval(
-        lambda one, other: mean(one) - mean(other),
-        [weeks + 1.0, weeks],
-        np.arange(60) // 20,
-        generator(),
-    )
-    np.testing.assert_allclose(found, 1.0, rtol=1e-9)
-
-
 def test_samples_of_other_weeks_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sample \(2, 5\): valid is \(trainings, 4 weeks\)"):
         bootstrap_interval(mean, [np.ones((2, 5))], np.zeros(4, dtype=np.int64), generator())

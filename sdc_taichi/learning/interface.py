@@ -6,6 +6,7 @@ A policy fits an environment, or the data centers of a run, if their interfaces 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
@@ -110,9 +111,9 @@ class Interface(Section):
     def difference(self, other: Interface) -> str | None:
         """First difference between this interface and another, as text; None if they are equal."""
         for name, label in _LABELS.items():
-            mine, theirs = getattr(self, name), getattr(other, name)
-            if mine != theirs:
-                return f"{label}: {_text(mine)} in training, {_text(theirs)} here"
+            ours, others = getattr(self, name), getattr(other, name)
+            if ours != others:
+                return f"{label}: {_text(ours)} in training, {_text(others)} here"
         for agent in self.agents:
             difference = _feature_difference(self.features[agent], other.features[agent])
             if difference is not None:
@@ -205,24 +206,21 @@ def _observed(features: Sequence[Feature]) -> tuple[ObservedFeature, ...]:
 
 
 def _feature_difference(
-    mine: Sequence[ObservedFeature], theirs: Sequence[ObservedFeature]
+    ours: Sequence[ObservedFeature], others: Sequence[ObservedFeature]
 ) -> str | None:
     """First difference between the features of an agent, as text; None if they are equal."""
-    by_name = {feature.name: feature for feature in theirs}
-    for feature in mine:
-        here = by_name.pop(feature.name, None)
-        if here is None:
-            return f"feature {feature.name!r} of the training is missing here"
-        if here.size != feature.size:
-            return f"{feature.name!r} has {feature.size} entries in training, {here.size} here"
-        if here != feature:
-            ranges = [f"{f.low:g}..{f.high:g} {f.unit}" for f in (feature, here)]
-            return f"{feature.name!r} is {ranges[0]} in training, {ranges[1]} here"
-    if by_name:
-        return f"feature {next(iter(by_name))!r} was not there in training"
-    if tuple(mine) != tuple(theirs):
-        return "features are in another order here than in training"
+    for feature, other in zip_longest(ours, others):
+        if feature != other:
+            return f"{_feature_text(feature)} in training, {_feature_text(other)} here"
     return None
+
+
+def _feature_text(feature: ObservedFeature | None) -> str:
+    """Name, entries and range of a feature."""
+    if feature is None:
+        return "no feature"
+    values = f"{feature.low:g}..{feature.high:g} {feature.unit}"
+    return f"feature {feature.name!r} ({feature.size} of {values})"
 
 
 def _text(value: Any) -> str:
