@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -90,7 +90,7 @@ class DataSet:
         return (self.mean_return(controller) - idle) / (self.mean_return(best) - idle)
 
 
-def returns_of(episodes: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+def returns_of(episodes: Iterable[dict[str, Any]]) -> pd.DataFrame:
     """The table ``DataSet.returns`` of the episodes of all controllers.
 
     Args:

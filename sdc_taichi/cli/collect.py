@@ -176,7 +176,8 @@ def _print_summary(made: DataSet) -> None:
     from sdc_taichi.benchmark.offline import CARD_FILE
 
     for name in made.collection.controllers:
-        row, score = made.returns.loc[name], made.score(name)
+        row: dict[str, Any] = dict(made.returns.loc[name])
+        score = made.score(name)
         text = "" if math.isnan(score) else f", score {100.0 * score:.1f} %"
         print(
             f"{name}: {int(row['episodes']):,} episodes, {int(row['steps']):,} steps, mean return "
