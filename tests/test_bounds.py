@@ -73,6 +73,8 @@ def test_every_number_has_bounds_at_both_ends(model: type[BaseModel]) -> None:
         ("tiny", "hvac.crac.supply_m3s_per_w=1e-30"),
         ("corrected", "hvac.crac.coasting_flow_ratio=1e-6"),
         ("corrected", "servers.power_w=[0.2, 0.06]"),
+        ("corrected", "servers.power_w=[1e308, 1e308]"),
+        ("corrected", "hall.layout.rack_pitch_m=1e-300"),
         ("tiny", "servers.groups.0.0.full_w=1e9"),
         ("tiny", "hall.supply_approach_k=[5, 5, 5, 400]"),
         ("tiny", "servers.inlet_range_c=[60, 82]"),
@@ -258,6 +260,24 @@ def test_weather_is_one_of_a_place_on_earth() -> None:
         drivers_from_arrays([68.0], *year[1:])
     with pytest.raises(DataError, match=r"ci_g_per_kwh .* is 5000"):
         drivers_from_arrays(*year[:2], [5000.0], year[3])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        ["battery.capacity_kwh=0"],
+        ["workload.flexible_share=0", "workload.queue_limit_h=0.001"],
+        ["servers.power_w=[150, 0]"],
+        ["hall.layout.containment=1", "hall.rows=1", "hall.racks_per_row=2"],
+    ],
+    ids=" ".join,
+)
+def test_odd_but_valid_halls_run(values: list[str]) -> None:
+    base = ["hall.supply_approach_k=4", "hall.return_approach_k=-3", "servers.power_w=[150, 10]"]
+    with Simulator(load_config("corrected", base + values)) as sim:
+        sim.reset(0)
+        for command in (-1.0, 1.0):
+            sim.step(Actions(load=command, cooling=command, battery=-command))
 
 
 @pytest.mark.parametrize("bad", [-1, 2.5, True, "3", 10**18])

@@ -15,8 +15,6 @@ from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
 from sdc_taichi.plant.electrical import LossyDevice
 from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
-from sdc_taichi.viz.recording_series import FIELD_ROWS, FIELDS
-from sdc_taichi.viz.recording_text import ConditionLog
 
 
 def charged(overrides: list[str], command: float = 1.0, steps: int = 8) -> list[StepResult]:
@@ -210,15 +208,3 @@ def test_nothing_is_lost_without_power() -> None:
     for name in ("ups_loss_w", "distribution_loss_w", "overhead_w", "grid_kwh"):
         lost = column(found, name)
         assert lost[0] > 0 == lost[1] == lost[2] < lost[3], name
-
-
-def test_the_log_of_a_recording_tells_of_an_overload() -> None:
-    with Simulator(load_config("tiny")) as sim:
-        log = ConditionLog(sim.fleet, 0)
-    values = np.zeros((4, len(FIELDS)))
-    values[1:3, FIELD_ROWS["grid_overload_kwh"]] = 2.0, 3.0
-    found = [(entry.step, entry.level, entry.text) for entry in log.entries(np.arange(4), values)]
-    assert found == [
-        (1, "ERROR", "grid connection overloaded: 2 kWh beyond its limit in the step"),
-        (3, "INFO", "grid connection within its limit again, 5 kWh beyond it in all (after 0.5 h)"),
-    ]

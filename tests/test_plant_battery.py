@@ -157,41 +157,11 @@ def test_paper_rates() -> None:
     assert slow.discharge_kwh[1] == pytest.approx(50.0)
 
 
-def test_released_charge() -> None:
-    # Empty: T = 0.25*round(sigmoid(5)/2, 4) h at a tenth of the capacity per hour.
-    assert run("released", [0.0], 1.0).charge_kwh[0] == pytest.approx(200.0 * 0.25 * 0.4967)
-    # Nearly full: T = 0.25*0.0033 h, and the room over T + 0.04 h.
-    room = run("released", [1999.999], 1.0).charge_kwh[0]
-    assert room == pytest.approx(0.001 / (0.04 + 0.25 * 0.0033) * 0.25 * 0.0033, rel=0.5)
-    assert run("released", [1999.0], 1.0).charge_kwh[0] == pytest.approx(
-        1.0 / (0.04 + 0.25 * 0.0034) * 0.25 * 0.0034, abs=1e-4
-    )
-
-
-def test_released_discharge_limits() -> None:
-    # Load: a quarter of it, for T = sigmoid(10*(0.5 - 0.25)) h.
-    sigmoid = 1.0 / (1.0 + np.exp(-2.5))
-    loaded = run("released", [1000.0], -1.0, load_kw=400.0)
-    assert loaded.discharge_kwh[0] == pytest.approx(100.0 * sigmoid, abs=1e-5)
-    # Capacity: C for T at a load beyond it, and the content over T + 0.01 h.
-    heavy = run("released", [2000.0], -1.0, load_kw=1e6)
-    full_h = 1.0 / (1.0 + np.exp(-7.5))
-    assert heavy.discharge_kwh[0] == pytest.approx(2000.0 / (full_h + 0.01) * full_h, abs=1e-5)
-    # Nearly empty: T is at least 0.125 h.
-    low = run("released", [10.0], -1.0, load_kw=1e6)
-    assert low.discharge_kwh[0] == pytest.approx(10.0 / 0.135 * 0.125, abs=1e-5)
-
-
 def test_released_step_length_scales_with_the_step() -> None:
     quarter = run("released", [600.0, 600.0], [1.0, -1.0], load_kw=200.0)
     hour = run("released", [600.0, 600.0], [1.0, -1.0], load_kw=200.0, dt_h=1.0)
     np.testing.assert_allclose(hour.charge_kwh, 4.0 * quarter.charge_kwh, atol=1e-4)
     np.testing.assert_allclose(hour.discharge_kwh, 4.0 * quarter.discharge_kwh, atol=1e-4)
-
-
-def test_released_store_has_eight_decimals_of_a_mwh() -> None:
-    stored = run("released", np.linspace(3.0, 1900.0, 40), -1.0).stored_kwh / 1e3
-    np.testing.assert_array_equal(stored, np.round(stored, 8))
 
 
 @given(names, shares, commands, shares, st.floats(0.0, 2e4))

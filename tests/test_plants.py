@@ -9,7 +9,7 @@ from ledgers import LEDGERS, TRANSIENT_LEDGERS, residual
 from model_steps import chiller_step
 from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
+from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.types import F64
 from test_ledgers import assert_closes, record, sites_and_seasons
@@ -60,17 +60,6 @@ def test_york_machine_is_sized_for_cold_condenser_water() -> None:
             # The margin of 1.15 counts at the design wet bulb, 5 % of it at any other.
             need_w = design.cooling_w * (1.0 if condenser_c == 30.0 else 1.05 / 1.15)
             assert machine.available_w >= need_w * (1.0 - 1e-9)
-
-
-def test_chiller_with_a_large_margin_is_sized_by_the_design_wet_bulb_alone() -> None:
-    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
-    overrides = ["hvac.chiller.model=eir_york", "hvac.sizing.margin=1.35",
-                 "hvac.sizing.design_wet_bulb_c=25.5"]  # fmt: skip
-    with Simulator(load_config("corrected", overrides), drivers=drivers) as sim:
-        design = sim.sizing.water_side
-    # As EnergyPlus was given it: 761.7 kW of cooling, 684.4 kW at the reference point.
-    taken_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
-    assert design.chiller_w / taken_w == pytest.approx(684.437 / 761.725, rel=1e-3)
 
 
 @pytest.mark.parametrize(("model", "warmest_c"), [("eir_york", 8.89), ("centrifugal_vsd", 20.0)])
@@ -188,17 +177,6 @@ def test_dry_cooler_makes_no_water_colder_than_the_air() -> None:
     left_k = range_k * result.chiller_load_w / result.heat_removed_w
     assert np.all(result.chilled_water_c + left_k >= result.outdoor_c - 1e-9)
     assert result.chiller_load_w[0] == 0
-
-
-def test_openings_that_are_left_have_a_share_of_the_fans() -> None:
-    event = "events.scheduled=[{kind: outdoor_air_closed, start_h: 0, duration_h: 1, share: 0.5}]"
-    result, design = steady([*DRY["air_side"], event], [22.0], [12.0])
-    # In the warm all the air that is left comes in, at full speed.
-    outdoor_m3s = result.economiser_w / (
-        design.air_j_per_m3_k * (result.return_c - result.outdoor_c)
-    )
-    assert outdoor_m3s == pytest.approx(0.5 * design.tower_air_m3s, rel=1e-9)
-    assert result.tower_fan_w == pytest.approx(0.5 * design.tower_fan_w, rel=1e-9)
 
 
 def test_outdoor_air_cools_while_it_is_cool_and_neither_dry_nor_humid() -> None:
@@ -335,23 +313,3 @@ def test_chiller_without_capacity_is_an_error() -> None:
            "hvac.chiller.coil_approach_k=11"]  # fmt: skip
     with pytest.raises(PhysicalLimitError, match="no capacity at its design weather, 60 C of cond"):
         steady(hot, [20.0], [15.0])
-
-
-def design_of(model: str) -> WaterSideDesign:
-    return steady([f"hvac.chiller.model={model}"], [30.0], [20.0])[1]
-
-
-def test_reference_cop_is_that_of_the_machine_unless_it_is_given() -> None:
-    cops = {
-        model: np.asarray(design_of(model).machine.reference_cop)[0]
-        for model in ("centrifugal_vsd", "electric_water_cooled", "electric_air_cooled")
-    }
-    assert cops == {
-        "centrifugal_vsd": 5.96,
-        "electric_water_cooled": 4.75,
-        "electric_air_cooled": 3.0,
-    }
-    given = ["hvac.chiller.model=electric_air_cooled", "hvac.chiller.reference_cop=3.4"]
-    assert steady(given, [30.0], [20.0])[1].machine.reference_cop == 3.4
-    with pytest.warns(OddInputWarning, match="air-cooled chillers reach about 4"):
-        steady([given[0], "hvac.chiller.reference_cop=5.96"], [30.0], [20.0])

@@ -21,11 +21,11 @@ class UpsConfig(Section):
     """
 
     no_load_share: Share = 0.01333
-    """Loss without load over rated power, 0..1."""
+    """Loss without load, divided by the rated power, 0..1."""
     proportional_share: Share = 0.0064
-    """Loss in proportion to the load, over the load, 0..1."""
+    """Loss in proportion to the load, divided by the load, 0..1."""
     square_share: Share = 0.01081
-    """Loss by the square of the load, over rated power at full load, 0..1."""
+    """Loss by the square of the load, divided by the rated power, at full load, 0..1."""
 
 
 class DistributionConfig(Section):
@@ -37,11 +37,11 @@ class DistributionConfig(Section):
     """
 
     no_load_share: Share = 0.0017
-    """Loss without load over rated power, 0..1."""
+    """Loss without load, divided by the rated power, 0..1."""
     proportional_share: Share = 0.0
-    """Loss in proportion to the load, over the load, 0..1."""
+    """Loss in proportion to the load, divided by the load, 0..1."""
     square_share: Share = 0.024
-    """Loss by the square of the load, over rated power at full load, 0..1."""
+    """Loss by the square of the load, divided by the rated power, at full load, 0..1."""
 
 
 class ElectricalConfig(Section):
@@ -51,8 +51,8 @@ class ElectricalConfig(Section):
     """Treatment of the losses of UPS and distribution: ``counted`` in grid energy, PUE, carbon and
     cost, or only ``reported`` beside them."""
     capacity_ratio: Annotated[float, Field(ge=1, le=10)] = 1.25
-    """Rated power of UPS and distribution over what they carry at the design point, 1..10: five
-    modules where four suffice are 1.25, two paths of which each suffices are 2."""
+    """Rated power of UPS and distribution, divided by their load at the design point, 1..10: 1.25
+    for five modules of which four suffice, 2 for two paths of which each suffices."""
     ups: UpsConfig = UpsConfig()
     """Losses of the UPS."""
     distribution: DistributionConfig = DistributionConfig()
@@ -61,8 +61,8 @@ class ElectricalConfig(Section):
     """Most power that the grid connection carries, in kW, 0.1..1e8: from a single server to ten
     times the largest campus that has been announced; None takes ``grid_limit_ratio``."""
     grid_limit_ratio: Annotated[float, Field(ge=0.01, le=1000)] | None = None
-    """Most power that the grid connection carries over the facility's power at the design point,
-    0.01..1,000; None is no limit, where ``grid_limit_kw`` gives none."""
+    """Most power that the grid connection carries, divided by the facility's power at the design
+    point, 0.01..1,000; None is no limit, where ``grid_limit_kw`` gives none."""
 
 
 Price = Annotated[float, Field(ge=0, le=1e9)]

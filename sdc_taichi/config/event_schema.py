@@ -62,8 +62,8 @@ class ProtectionConfig(Section):
     """
 
     ashrae_class: Literal["A1", "A2", "A3", "A4"] | None = None
-    """ASHRAE TC 9.9 (2021) class of the servers, whose allowable range has the limit of the inlets;
-    None is no protection."""
+    """ASHRAE TC 9.9 (2021) class of the servers; the upper end of its allowable range is the limit
+    of the inlets. None is no protection."""
     throttle_share: Share = 0.5
     """Utilisation that a throttled rack may reach, 0..1."""
     trip_margin_k: RiseK = 5.0

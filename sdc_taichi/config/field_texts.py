@@ -127,7 +127,7 @@ def commented_yaml(config: DataCenterConfig) -> str:
 
 
 def _commented(values: dict[str, Any], model: type[BaseModel], indent: str) -> list[str]:
-    """Lines of a section, with what each field is and which values are valid."""
+    """Lines of a section, with meaning and valid values of each field."""
     schema, docs = model.model_json_schema(), docstrings(model)
     lines = []
     for name, entry in schema["properties"].items():

@@ -64,7 +64,7 @@ DeviceW = Annotated[float, Field(ge=0, le=1e9)]
 """Power of a device that serves a whole hall, 0..1e9 W."""
 FlowM3sPerW = Annotated[float, Field(ge=1e-5, le=0.01)]
 """Airflow per power, 1e-5..0.01 m3/s per W: the power warms the air by 81 K at the lower end, more
-than any server bears, and by less than 0.1 K at the upper."""
+than any server tolerates, and by less than 0.1 K at the upper."""
 PowerRatio = Annotated[float, Field(ge=0, le=2)]
 """Power divided by that at full load, 0..2: turbo clocks and leakage do not double it."""
 FlowRatio = Annotated[float, Field(ge=-1, le=10)]
@@ -75,7 +75,7 @@ for days to flywheels and capacitors that last for seconds."""
 Count = Annotated[int, Field(ge=1, le=10_000)]
 """A number of parts, 1..10,000: more servers or zones than any rack has."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
-"""Seed of what is random, 0..2**63 - 1."""
+"""Seed of random numbers, 0..2**63 - 1."""
 Text = Annotated[str, Field(max_length=10_000)]
 """Text of up to 10,000 characters, all of which a file can hold."""
 Name = Annotated[str, Field(min_length=1, max_length=10_000, pattern=r"\S")]
@@ -189,7 +189,7 @@ def validated(model: type[Model], values: Any, label: str) -> Model:
 
 
 def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
-    """One line on what is wrong, with key, value and what is valid.
+    """One line that names each wrong key, its value and the valid values.
 
     Args:
         error: errors of pydantic.

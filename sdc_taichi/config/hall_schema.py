@@ -1,4 +1,4 @@
-"""Sections ``hall`` and ``servers``: racks, their layout, recirculation, and what servers draw."""
+"""Sections ``hall`` and ``servers``: racks, layout, recirculation, and power of the servers."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ class RecirculationConfig(Section):
     decay_m: LengthM = 3.0
     """Length over which the exhaust of another rack loses weight by a factor of e, in m."""
     cutoff: Annotated[float, Field(ge=0, le=0.01)] = 1e-4
-    """Share of what a rack amid the hall collects below which the weight of a source is left out,
-    in halls of more than 64 racks; 0 keeps all sources."""
+    """Smallest weight of a source, as a share of the sum of weights of a rack in the middle of the
+    hall, in halls of more than 64 racks; 0 keeps all sources."""
     matrix_file: FileName | None = None
     """File (.npz, .csv) with the matrix R or D of a CFD study, in place of the weights that follow
     from the layout; None is the layout."""
@@ -262,7 +262,7 @@ class HallConfig(Section):
     one for all racks, or one per rack."""
     design_supply_c: AirC = 23.0
     """Supply air at the design point, in C, at which the approach temperatures hold and devices are
-    sized for full load; limits of the setpoint bound actions alone. With approach temperatures of
+    sized for full load; limits of the setpoint bound only actions. With approach temperatures of
     5 K, 23 C brings inlets to 28 C, the warm end of ``servers.inlet_range_c``."""
     layout: LayoutConfig = LayoutConfig()
     """Measures of the hall."""
@@ -401,7 +401,7 @@ class ServerConfig(Section):
     """Airflow ratio against inlet temperature and load: as the ratios above give it, or scaled as
     in the released SustainDC."""
     fan_airflow_ratio_limits: Annotated[tuple[FlowRatio, FlowRatio], Ordered] | None = None
-    """Lowest and highest airflow ratio; None bounds the ratio at 0 alone, since fans never blow
+    """Lowest and highest airflow ratio; None has only the lower limit 0, since fans never blow
     backwards."""
     fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
     """Exponent of fan power over the airflow ratio, 1..3."""

@@ -324,7 +324,7 @@ class WaterConfig(Section):
     saturated, from heat that leaves as vapour alone, or by the fits of the released SustainDC and
     of its paper."""
     cycles_of_concentration: Annotated[float, Field(ge=1.01, le=1000)] = 5.0
-    """Concentration of solids in the tower water over that in the make-up water, 1.01..1,000:
+    """Concentration of solids in the tower water divided by that in the make-up water, 1.01..1,000:
     blowdown is 100 times the evaporation at the lower end and a thousandth of it at the upper."""
     drift_share: Annotated[float, Field(ge=0, le=0.01)] = 2e-5
     """Drift over the water flow of the tower, 0..0.01; towers without drift eliminators lose up to

@@ -28,7 +28,7 @@ _REPLACES: dict[str, dict[str, Any]] = {
     "servers.fan_reference_w": {"servers.fan_reference_share": None},
     "servers.fan_reference_share": {"servers.fan_reference_w": None},
 }
-"""Fields that take the place of inherited ones, and what these become then."""
+"""Fields that replace inherited ones, and the values of the replaced fields."""
 
 
 def preset_names() -> list[str]:
@@ -222,7 +222,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
         override: ``a.b=c``; ``c`` is read as YAML.
 
     Raises:
-        ConfigError: no assignment, or one into what is no section.
+        ConfigError: no assignment, or an assignment to something other than a section.
     """
     path, sign, text = override.partition("=")
     if not sign:

@@ -29,7 +29,7 @@ LEAST_USUAL_GRID_RATIO = 0.5
 
 
 def odd_values(config: DataCenterConfig) -> Iterator[str]:
-    """Messages about unusual values of a configuration: field, value and what is usual."""
+    """Messages about unusual values of a configuration, with field, value and usual values."""
     yield from _odd_servers(config)
     chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
     dry = PLANTS[config.hvac.plant_in_use].dry

@@ -75,7 +75,7 @@ class BatteryConfig(Section):
     """Share v of the capacity in the upper limit of the stored energy, 0..1."""
     lower_u_h: Annotated[float, Field(ge=0, le=100)] = 0.01
     """Slope u of the lower limit of the stored energy, u P + v capacity, against the discharge
-    power P, in h, 0..100; it is the time for which what is left would last."""
+    power P, in h, 0..100; it is the time for which the remaining energy would last."""
     lower_v: Share = 0.0
     """Share v of the capacity in the lower limit of the stored energy, 0..1."""
 
@@ -331,7 +331,7 @@ class DataCenterConfig(Section):
 
     @property
     def room_heat_capacity_kj_per_k(self) -> float:
-        """Heat capacity of what follows the supply air, in kJ/K per server."""
+        """Heat capacity of coils, floor and the rest of the room, in kJ/K per server."""
         configured = self.hall.room_heat_capacity_kj_per_k_per_server
         return ROOM_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
 

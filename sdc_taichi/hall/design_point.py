@@ -52,12 +52,12 @@ class DesignPoint:
     server_rise_k: F64
     """Temperature rise of the air through the servers of each group, in K, (G,)."""
     approach_k: F64
-    """Airflow-weighted mean inlet of each rack over supply air, in K, (R,)."""
+    """Airflow-weighted mean inlet of each rack above supply air, in K, (R,)."""
     outlet_rise_k: F64
-    """Airflow-weighted mean outlet of each rack over supply air, in K, (R,)."""
+    """Airflow-weighted mean outlet of each rack above supply air, in K, (R,)."""
     height_factor: F64
-    """Exhaust share of the intake of each group over that of its rack, by height, (G,). Its mean
-    over the airflow of a rack is 1."""
+    """Exhaust share of the intake of each group divided by that of its rack, by height, (G,). Its
+    mean over the airflow of a rack is 1."""
 
     def setpoint_over_supply_k(self, config: DataCenterConfig) -> float:
         """Setpoint of the CRAC units less their coldest supply air, in K.
@@ -83,7 +83,7 @@ def design_point(
     Args:
         config: The data center.
         servers: Its ``rack_servers``; None computes them.
-        approach_k: Inlet over supply air, K, (R,); None is as given in the config.
+        approach_k: Inlet above supply air, K, (R,); None is as given in the config.
 
     Raises:
         ConfigError: approach temperatures that leave no room for heating the air.
@@ -115,7 +115,7 @@ def design_point_at(
         servers: Its ``rack_servers``.
         inlet_c: Inlet of each server group, C, (G,).
         height_factor: Height factors of the groups, dimensionless, (G,).
-        approach_k: Inlet over supply air, K, (R,), that the airflow of the servers follows from
+        approach_k: Inlet above supply air, K, (R,), that the airflow of the servers follows from
             unless it is given.
         full_airflow_m3s: Airflow of one server of each group at an airflow ratio of 1, m3/s, (G,);
             None is as configured, or else as follows from ``approach_k``.
@@ -292,7 +292,7 @@ def _small_units(config: DataCenterConfig, design: DesignPoint) -> Iterator[str]
 
 
 def _racks(rack_rise_k: F64, limit_k: float) -> str:
-    """Text that names the racks whose rise exceeds a limit, and by how much they warm the air."""
+    """Text with the racks whose temperature rise exceeds a limit, and their rises."""
     warm = np.flatnonzero(rack_rise_k > limit_k)
     numbers = ", ".join(map(str, warm[:_MOST_LISTED]))
     left = len(warm) - _MOST_LISTED

@@ -8,16 +8,16 @@ table with cubics.
 
 Worked example: a hall of two racks, each of which takes in 10 % exhaust air, all of it from the
 other rack, at a supply of 20 C and full load. Let the racks warm their air by 12 and 8 K. The
-*mix* before rack 0 is the outlet of rack 1 over the supply, and the other way round; the inlet of
-a rack is 0.1 times its mix. Starting from mixes of 0, the outlets are (12, 8) K over the supply, so
-the mixes that they make are (8, 12) K, the inlets 0.8 and 1.2 K, and the outlets then 12.8 and
+*mix* before rack 0 is the outlet of rack 1 above the supply, and the other way round; the inlet of
+a rack is 0.1 times its mix. Starting from mixes of 0, the outlets are (12, 8) K above the supply,
+so the mixes that they make are (8, 12) K, the inlets 0.8 and 1.2 K, and the outlets then 12.8 and
 9.2 K, if the rise of a rack does not change with its inlet: the *feedback gain*, the change of an
 outlet with its mix, is 0.1. The *residual* of a search is the mix that the outlets make less the
-mix that they were computed for, here (8, 12) - (0, 0). A Newton step adds what the residual
-brings about in turn, r + w G r + w G w G r + ..., with weights w = [[0, 1], [1, 0]] and gains G =
-0.1: (8, 12) + 0.1 (12, 8) + 0.01 (8, 12) + ... = (9.29, 12.93) K, which is the answer. Racks of a
-real hall move more air as they get warmer, so gains are read off the last two steps, and few steps
-are needed.
+mix that they were computed for, here (8, 12) - (0, 0). A Newton step adds what the residual brings
+about in turn, r + w G r + w G w G r + ..., with weights w = [[0, 1], [1, 0]] and gains G = 0.1: (8,
+12) + 0.1 (12, 8) + 0.01 (8, 12) + ... = (9.29, 12.93) K, which is the answer. Racks of a real hall
+move more air as they get warmer, so gains are read off the last two steps, and few steps are
+needed.
 
 The answers of all supplies and loads are then written as sums of patterns. If the mixes of the two
 racks were (9.29, 12.93) K times the load everywhere, one pattern (0.58, 0.81) would hold them all,
@@ -85,7 +85,7 @@ class SteadyStateTable:
     """Supply temperatures of the table, evenly spaced, in C, (n,)."""
     patterns: F64
     """Patterns over the racks, (k, R). In halls of up to DENSE_RACKS they are patterns of the
-    exhaust mix over supply air. In larger halls they are, at the design point and in K, the mix of
+    exhaust mix above supply air. In larger halls they are, at the design point and in K, the mix of
     approach temperatures, the mix of temperature rises, the approach temperatures and the rises of
     the racks themselves, (4, R)."""
     pattern_shares: F32
@@ -99,7 +99,7 @@ class SteadyStateTable:
 def initial_guess(
     config: DataCenterConfig, servers: RackServers, recirculation: Recirculation
 ) -> SteadyStateTable:
-    """Table of the steady states of a hall whose CRAC units cover what its racks need.
+    """Table of the steady states of a hall whose CRAC units supply enough air for its racks.
 
     All racks have the same load. Halls of up to DENSE_RACKS are computed as they are, larger ones
     as the mean of SAMPLED_RACKS racks.
@@ -143,12 +143,13 @@ class _HallPart(NamedTuple):
     group_offsets: I32
     """First server group of each rack, (R + 1,)."""
     columns: F64
-    """Rows count, full power, idle power, load deviation, full airflow over that of the largest
-    server, fan power at the reference ratio and exhaust share of the server groups, (7, G)."""
+    """Rows count, full power, idle power, load deviation, full airflow divided by that of the
+    largest server, fan power at the reference ratio and exhaust share of the server groups, (7,
+    G)."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     design_mix_k: F64
-    """Exhaust mix before each rack over supply air at the design point, in K, (R,)."""
+    """Exhaust mix before each rack above supply air at the design point, in K, (R,)."""
 
 
 def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart:
@@ -163,7 +164,7 @@ def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart
 
 
 def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallPart:
-    """A sample of the racks of a hall as one rack that breathes its own exhaust."""
+    """A sample of the racks of a hall as one rack that takes in its own exhaust."""
     offsets, outlet_rise_k = servers.group_offsets, recirculation.design.outlet_rise_k
     racks = len(outlet_rise_k)
     # Racks at the ends of rows breathe more exhaust than others: some of each.
@@ -253,7 +254,7 @@ class _SteadyStates:
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     density_ratio: DensityRatio
-    """Density of the air over that at the reference temperature."""
+    """Density of the air divided by that at the reference temperature."""
     k_per_w: float
     """Temperature rise of the air of the largest server per power at an airflow ratio of 1, in
     K/W."""
@@ -262,11 +263,11 @@ class _SteadyStates:
     load: F64
     """Load of each pair, 0..1, (m,)."""
     mix_k: F64
-    """Exhaust mix before each rack over supply air, in K, (R, m)."""
+    """Exhaust mix before each rack above supply air, in K, (R, m)."""
     feedback_gain: F64
     """Change of each rack's outlet with a change of the mix before it, in K/K, (R, m)."""
     inlet_k: F64 | None = None
-    """Airflow-weighted mean inlet of each rack over supply air, in K, (R, m)."""
+    """Airflow-weighted mean inlet of each rack above supply air, in K, (R, m)."""
     heat_k: F64 | None = None
     """Temperature rise of the air through each rack, in K, (R, m)."""
 
@@ -306,7 +307,7 @@ class _SteadyStates:
         self.feedback_gain = np.clip(gain, -_MOST_GAIN, _MOST_GAIN)
 
     def _outlet_k(self, groups: F64) -> F64:
-        """Outlets of the racks over supply air with the present mixes, in K, (R, m).
+        """Outlets of the racks above supply air with the present mixes, in K, (R, m).
 
         Keeps ``inlet_k`` and ``heat_k``, of which outlets are the sum.
         """

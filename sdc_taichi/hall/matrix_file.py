@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,7 +13,6 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.hall.design_point import DesignPoint
-from sdc_taichi.number_text import parse_number
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_MATRIX_BYTES, ArrayFile, decoding, open_input
 
@@ -147,52 +145,13 @@ def _read_csv(path: Path, file: BinaryIO) -> F64:
     """Numbers of a .csv file, of whatever shape."""
     with (
         io.TextIOWrapper(file, "utf-8-sig") as text,
-        decoding(path, "a matrix", ConfigError),
+        decoding(path, "rows of numbers separated by ','", ConfigError),
         warnings.catch_warnings(),
     ):
         # NumPy warns about a file without numbers, which the check of the shape refuses.
         warnings.simplefilter("ignore", UserWarning)
-        try:
-            rows = (row for _, row in _rows(text))
-            return np.loadtxt(rows, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
-        except ValueError:
-            text.seek(0)
-            _check_lines(path, text)
-            raise
-
-
-def _rows(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Number of each line that is neither blank nor a comment, from 1, and its text."""
-    for number, line in enumerate(lines, start=1):
-        text = line.partition("#")[0].strip()
-        if text:
-            yield number, text
-
-
-def _check_lines(path: Path, lines: Iterable[str]) -> None:
-    """Find the first line of a .csv file that is no row of as many numbers as the first.
-
-    Raises:
-        ConfigError: naming the line and what is wrong with it.
-    """
-    width = 0
-    for number, row in _rows(lines):
-        cells = row.split(",")
-        for cell in cells:
-            try:
-                parse_number(cell)
-            except ValueError:
-                text = shortened(cell.strip())
-                why = ", separated by ','" if ";" in cell or len(cell.split()) > 1 else ""
-                why += ", without a header" if not width else ""
-                raise ConfigError(
-                    f"{path}: line {number}: {text} is no number; valid are numbers alone{why}"
-                ) from None
-        if width and len(cells) != width:
-            raise ConfigError(
-                f"{path}: line {number}: {len(cells)} numbers; valid are {width}, as above"
-            )
-        width = len(cells)
+        lines = (line.strip() for line in text)
+        return np.loadtxt(lines, delimiter=",", ndmin=2, dtype=np.float64)
 
 
 def _check_shape(path: Path, kind: str, shape: tuple[int, ...], racks: int) -> None:

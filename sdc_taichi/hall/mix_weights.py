@@ -173,7 +173,7 @@ def _path_m(
 
 
 def _path_weights(hall: HallConfig, path_m: F64, shortest_m: F64) -> F64:
-    """Weights of a rack's sources over that of its nearest; the scale cancels in its norm."""
+    """Weights of a rack's sources divided by that of its nearest; the scale cancels in its norm."""
     return np.asarray(np.exp((shortest_m - path_m) / hall.recirculation.decay_m))
 
 

@@ -22,7 +22,7 @@ class AirProperties(NamedTuple):
     j_per_m3_k: float
     """Heat capacity by volume at REFERENCE_C, rho cp, in J/(m3 K)."""
     density_ratio: DensityRatio
-    """Density over that at REFERENCE_C against temperature."""
+    """Density divided by that at REFERENCE_C against temperature."""
 
 
 def air_properties(config: DataCenterConfig) -> AirProperties:
@@ -70,8 +70,8 @@ class RackServers:
     fan_reference_w: F64
     """Fan power of one server at the reference airflow ratio, in W, (G,)."""
     height_factor: F64
-    """Exhaust share of the intake of each group over that of its rack, by height, (G,). Its mean
-    over the airflow of a rack is near 1."""
+    """Exhaust share of the intake of each group divided by that of its rack, by height, (G,). Its
+    mean over the airflow of a rack is near 1."""
     air: AirProperties
     """Air that the servers take in."""
 

@@ -47,7 +47,7 @@ _CONTAINED_WITHIN_K = 1e-9
 
 
 OVER_M = 2.3
-"""Length over which racks at the end of a row lack neighbours whose exhaust comes over them."""
+"""Length of the range at the end of a row where less exhaust comes over the racks."""
 NEIGHBOURS_M = 2.2
 """Length over which racks of an aisle share its supply air."""
 LEAST = 0.15
@@ -111,7 +111,7 @@ def _calibrated(
     """Recirculation of a hall that has a design point without it.
 
     Containment c closes the share c of the paths both ways: racks take in r (1 - c) of exhaust air,
-    and b (1 - c) of the supply air bypasses them. The units are sized for what that leaves.
+    and b (1 - c) of the supply air bypasses them. The units are sized for the remaining airflows.
     """
     if config.hall.recirculation.matrix_file is None:
         weights, open_share, design = _from_layout(config, servers, design)
@@ -262,7 +262,7 @@ def _solve_design_point(
     Args:
         config: The data center.
         servers: Its ``rack_servers``.
-        approach_k: Inlet over supply air, K, (R,), that follows from a design point.
+        approach_k: Inlet above supply air, K, (R,), that follows from a design point.
 
     Raises:
         ConfigError: no steady state.
@@ -318,7 +318,7 @@ def _settled(
 
     Args:
         config: The data center, for the error.
-        start_k: Temperatures over supply air that the first update takes, K, (R,).
+        start_k: Temperatures above supply air that the first update takes, K, (R,).
         update: Temperatures that follow from those before, K, (R,), and the result that goes with
             them.
         within_k: Change at which the temperatures count as steady, K.
@@ -388,17 +388,17 @@ class _Coefficients:
     """Coefficients of the exposure for one place of the returns."""
 
     around: float
-    """Exposure at the very end of a row by what comes round it."""
+    """Exposure at the very end of a row to air that comes round it."""
     around_length_m: float
     """Length over which air that comes round the end of a row fades, in m."""
     around_closed: float
     """Share of ``around`` that full containment takes away beyond what it takes from all paths."""
     over: float
-    """Exposure that a rack at the very end of a row lacks of what comes over the racks."""
+    """Reduction of the exposure at the very end of a row to air that comes over the racks."""
     over_closed: float
     """Share of ``over`` that full containment takes away beyond what it takes from all paths."""
     demand: float
-    """Change of the exposure over that of the demand for air, relative to its mean."""
+    """Change of the exposure divided by that of the demand for air, relative to its mean."""
 
 
 _BY_RETURNS = {

@@ -90,7 +90,7 @@ def airflow_with_losses_m3s(
     Args:
         full_m3s: Airflow of each unit at full speed, m3/s, (U,).
         running: 1 for units that run, 0 for those that are down, (U,); at least one runs.
-        coasting_ratio: Airflow of a unit that is down over that at full speed.
+        coasting_ratio: Airflow of a unit that is down divided by that at full speed.
         design_m3s: Airflow of all units at the design point, m3/s.
     """
     coasting_m3s = (1.0 - running) * coasting_ratio * full_m3s

@@ -44,7 +44,7 @@ class LayoutSolution:
     supply_share: F64
     """Share of each rack's intake that comes from the floor tiles, (R,)."""
     approach_k: F64
-    """Inlet of each rack over supply air, in K, (R,)."""
+    """Inlet of each rack above supply air, in K, (R,)."""
     supply_c: float
     """Supply air, in C."""
     return_c: float
@@ -252,7 +252,7 @@ class _GridAir:
             rise_k: Temperature rise through each rack, K, (R,).
 
         Returns:
-            Inlets over supply air, K, (R,), and flow times temperature over supply air in the
+            Inlets above supply air, K, (R,), and flow times temperature above supply air in the
             returns, m3 K/s.
         """
         backs = self._grid.backs
@@ -354,7 +354,7 @@ class _SystemSolution:
     returned: F64
     """Flow times value into the returns, (T,)."""
     relative_residual: F64
-    """Norm of the residual over that of the right side, (T,)."""
+    """Norm of the residual divided by that of the right side, (T,)."""
     iterations: I32
     """Iterations done for each right side, (T,)."""
 
@@ -380,7 +380,7 @@ def solve_at_design_point(
             "server by its own power; valid is server"
         )
     hall = config.hall
-    # CRAC units of contained halls are sized for what containment leaves of recirculation.
+    # CRAC units of contained halls are sized for the recirculation that containment leaves.
     contained = hall.layout.containment > 0 and hall.inlet_model == "recirculation"
     design = calibrate(config).design if contained else design_point(config)
     return solve(

@@ -16,14 +16,14 @@ GAS_CONSTANT_J_PER_KG_K = 287.05
 ZERO_C_K = 273.15
 """Temperature of 0 C, in K."""
 REFERENCE_C = 20.0
-"""Temperature of the air in whose volume airflows are counted, in C: the standard air of fans."""
+"""Temperature at which airflows are given as volumes, in C: that of the standard air of fans."""
 EXACT_AT_C = (18.0, 32.0)
 """Temperatures at which the straight line of ``OF_IDEAL_GAS`` is exact, in C."""
 
 
 @dataclass(frozen=True, slots=True)
 class DensityRatio:
-    """Density of air over that at REFERENCE_C and the same pressure, as a line over temperature."""
+    """Density of air divided by that at REFERENCE_C and equal pressure, linear in temperature."""
 
     base: float
     """Ratio at 0 C, dimensionless."""

@@ -12,7 +12,7 @@ import numpy as np
 from sdc_taichi.types import Values
 
 WATER_TO_DRY_AIR = 0.621945
-"""Molar mass of water over that of dry air."""
+"""Molar mass of water divided by that of dry air."""
 DRY_AIR_J_PER_KG_K = 1006.0
 """Heat capacity of dry air, in J/(kg K)."""
 VAPOUR_J_PER_KG_K = 1860.0
@@ -34,8 +34,8 @@ at sea level those of -21 C and of 57 C."""
 _SATURATED_C = (-38.1362, -5.41559, 3.30688, -0.347603, 0.0156315, -0.000264233)
 _SATURATED_C_BY_PRESSURE = (-14.5864, 3.54943, -0.0968119)
 _SATURATED_C_BY_SQUARE = -0.711883
-"""Temperature of saturated air in powers of sqrt(h + 40), h in kJ/kg, and what pressure q over that
-of the standard atmosphere less 1 adds, times q and q^2: within 0.17 K at 65..105 kPa."""
+"""Temperature of saturated air in powers of sqrt(h + 40), h in kJ/kg, and what pressure q divided
+by that of the standard atmosphere less 1 adds, times q and q^2: within 0.17 K at 65..105 kPa."""
 
 
 def saturation_pa(temperature_c: Values) -> Values:
@@ -68,7 +68,7 @@ def vapour_ratio(vapour_pa: Values, pressure_pa: Values) -> Values:
 
 
 def enthalpy_j_per_kg(temperature_c: Values, ratio: Values) -> Values:
-    """Enthalpy of moist air over that of dry air and water at 0 C, J per kg of dry air.
+    """Enthalpy of moist air relative to that of dry air and water at 0 C, J per kg of dry air.
 
     Args:
         temperature_c: Temperature, C.

@@ -153,7 +153,8 @@ def _tower_setpoint_c(
 ) -> F64:
     """Water temperature that the tower is controlled to, in C, (B,).
 
-    As cold as the economiser or else the chiller can use, and not below what the weather gives.
+    It is as cold as the economiser, or else the chiller, can use, but no colder than the weather
+    allows.
     """
     economiser_c = chilled_water_c - design.exchanger_approach_k
     useful_c = np.where(share > 0, economiser_c, design.min_condenser_c)
@@ -175,8 +176,8 @@ def air_cooled(
     1: no water leaves colder than the outdoor air.
 
     The heat of a cooler that needs less grows with the airflow to the power 3/4, as that of a film
-    does, and the fan power with its cube, so the fans draw the fourth power of the heat over that
-    at full speed.
+    does, and the fan power with its cube, so the fans draw the fourth power of the heat divided by
+    that at full speed.
     """
     load_w = np.minimum(requested_w, design.pumped_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.setpoint_c, design)
@@ -317,7 +318,7 @@ def _dry(
     condenser_pump_w: F64,
     humidifier_kg_s: Values = 0.0,
 ) -> WaterSideResult:
-    """Result of a plant without tower water; what cools its condenser is outdoor air."""
+    """Result of a plant without tower water, whose condenser is cooled by outdoor air."""
     nothing = 0.0 * removed_w
     return WaterSideResult(
         heat_removed_w=removed_w,

@@ -1,8 +1,8 @@
 """Power and airflow of servers against inlet temperature and load, as pure functions.
 
-CPU power and airflow ratio (volume at the inlet over that at full speed) are linear in the inlet
-temperature and shift with the load; fan power is a power of the airflow ratio (Sun et al. 2021,
-*Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
+CPU power and airflow ratio (volume at the inlet divided by that at full speed) are linear in the
+inlet temperature and shift with the load; fan power is a power of the airflow ratio (Sun et al.
+2021, *Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
 Reference, ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` holds the same curves compiled.
 """
 
@@ -22,8 +22,8 @@ class ServerCurves:
 
     With x = min(inlet_c, curve_limit_c) and the utilisation u of the server, CPU power is
     max(idle, full*(cpu_slope*x + cpu_offset + cpu_shift*u)), the airflow ratio is
-    y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power over that at
-    the reference is (y/fan_reference_ratio)^fan_exponent.
+    y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power divided by
+    that at the reference is (y/fan_reference_ratio)^fan_exponent.
     """
 
     cpu_slope_per_k: float
@@ -66,7 +66,7 @@ class ServerCurves:
         Args:
             airflow_ratio: airflow ratio of each server, any shape.
             inlet_c: inlet temperature of each server in C, of the same shape.
-            density_ratio: density of the air over that at the reference temperature.
+            density_ratio: density of the air divided by that at the reference temperature.
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         return np.asarray(airflow_ratio * density_ratio.at(on_curve_c))

@@ -55,7 +55,7 @@ FREE_CONVECTION_SHARE = 0.125
 """Share of the full-speed cooling, and of the full-speed airflow, that is left when the fan stands
 still (default of EnergyPlus)."""
 MIN_AIR_RATIO = 0.2
-"""Lowest airflow of a running fan over that at full speed; below it the fan goes on and off
+"""Lowest airflow of a running fan divided by that at full speed; below it the fan goes on and off
 (default of EnergyPlus)."""
 
 _LEAST_K = 1e-9

@@ -45,7 +45,7 @@ class WaterPoint(NamedTuple):
     supply_setpoint_c: Values
     """CRAC supply setpoint, in C, (B,)."""
     cycles_of_concentration: Values
-    """Concentration of solids in the tower water over that in the make-up, above 1, (B,)."""
+    """Concentration of solids in the tower water divided by that in the make-up, above 1, (B,)."""
     drift_share: Values
     """Drift as a share of the tower water flow, (B,)."""
     dt_s: Values

@@ -116,13 +116,13 @@ def chilled_water_c(setpoint_c: F64, design: WaterSideDesign) -> F64:
 
 
 def coil_range_ratio(load_w: Values, design: WaterSideDesign) -> F64:
-    """Range of the chilled water at the coils over that at design, (B,); 1 with a fixed range.
+    """Range of the chilled water at the coils divided by that at design, (B,).
 
-    A coil that is larger than its load needs little water, which leaves it warmer: the range rises
-    as the load to the power -1/4. That is within 3 % of a counterflow coil whose airflow follows
-    its load, from full load down to a fifth, with resistances alike on both sides at design that go
-    with the airflow to the power -0.8 and with the water flow to the power -0.85 (Wetter 1999,
-    "Simulation model: finned water-air-coil without condensation", LBNL).
+    It is 1 with a fixed range. A coil that is larger than its load needs little water, which leaves
+    it warmer: the range rises as the load to the power -1/4. That is within 3 % of a counterflow
+    coil whose airflow follows its load, from full load down to a fifth, with resistances alike on
+    both sides at design that go with the airflow to the power -0.8 and with the water flow to the
+    power -0.85 (Wetter 1999, "Simulation model: finned water-air-coil without condensation", LBNL).
 
     Args:
         load_w: Heat that the coils take, W, (B,).
@@ -204,7 +204,7 @@ def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64
 
     Returns:
         Heat to take off the chilled water, W, (B,); power of its pumps, W, (B,); and the range of
-        the water at the coils over that at design, (B,).
+        the water at the coils divided by that at design, (B,).
     """
     range_ratio = coil_range_ratio(load_w, design)
     flow_w = load_w / range_ratio

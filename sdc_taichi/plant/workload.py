@@ -4,7 +4,8 @@ The queue is one array per data center: entry k is the work still queued that wa
 of step k, oldest step first. It never decreases along k, so length, due part and age histogram are
 read off it or are differences of two entries.
 Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step. A model decides
-what happens to work from what waits and what is due; ``sim.workload`` keeps the queues.
+how much work runs, waits or is dropped from the work that waits and that is due; ``sim.workload``
+keeps the queues.
 """
 
 from __future__ import annotations
