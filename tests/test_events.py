@@ -158,21 +158,6 @@ def test_an_event_covers_every_step_it_has_a_part_in(
     assert [s for s in range(200) if not line.at(s).grid_up[0]] == list(covered)
 
 
-def test_without_events_nothing_is_made() -> None:
-    line = timeline(data_center("a"), data_center("b"))
-    assert line.event_free
-    assert line.at(0) is line.at(10**9)
-    assert line.active(3) == []
-    assert line.reseeded(3) is line
-    for array in arrays(line, 0):
-        assert not array.flags.writeable
-    later = timeline(data_center(scheduled=(scheduled("grid_outage", 50.0, 1.0),)))
-    assert not later.event_free
-    assert later.at(0) is later.at(1)
-    assert later.at(200) is not later.at(0)
-    assert later.at(10**9) is later.at(0)
-
-
 @given(st.integers(0, 10), st.lists(st.integers(0, 2 * HOURS_PER_BLOCK), max_size=12))
 @settings(max_examples=15)
 def test_arrays_are_what_the_listed_events_say(seed: int, steps: list[int]) -> None:

@@ -46,15 +46,6 @@ def test_losses_of_a_large_hall_fit_into_memory() -> None:
     assert note == "Of 1,000 CRAC units, 9 are lost, one at a time."
 
 
-def test_so_many_units_that_some_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(failover, "MOST_LOSSES", 11)
-    config = with_values(load_config("corrected", SMALL), {"hvac.crac.units": 30})
-    losses, note = unit_losses(config)
-    assert len(losses) == 11
-    assert (losses[1].units, losses[-1].units) == ((0,), (29,))
-    assert "Of 30 CRAC units, 10 are lost, one at a time." in note
-
-
 def test_a_hall_lasts_longer_with_more_units(study: Failover) -> None:
     assert np.isnan(study.throttle_min[0])
     assert np.ptp(study.inlet_max_c[:, 0]) < 0.01

@@ -20,7 +20,6 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.exogenous import standard_pressure_pa
-from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet_configs import locations
@@ -105,26 +104,6 @@ def test_values_of_a_field() -> None:
     assert fleet.values("hvac.tower.economiser").tolist() == [1, 1]
 
 
-def test_what_is_no_part_of_a_hall_makes_no_other_hall(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = load_config("corrected")
-    laid_out = []
-
-    def find(config: DataCenterConfig, *parts: Any) -> SteadyStateTable:
-        laid_out.append(config.name)
-        return initial_guess(config, *parts)
-
-    monkeypatch.setattr("sdc_taichi.sim.fleet.initial_guess", find)
-    build_fleet(
-        [
-            named(hall, "first"),
-            named(hall, "same", "hvac.setpoint.initial_c=18", "hvac.chiller.reference_cop=7"),
-            named(hall, "warmer", "hvac.setpoint.max_c=24"),
-            named(hall, "more air", "hvac.crac.supply_m3s_per_w=6e-5"),
-        ]
-    )
-    assert laid_out == ["first", "warmer", "more air"]
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -178,14 +157,6 @@ def test_fleets_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
         build_fleet(half)
 
 
-def test_sums_of_a_ragged_fleet() -> None:
-    fleet = build_fleet(ragged())
-    assert fleet.unit_sums([1.0, 2.0, 4.0]).tolist() == [1, 2, 4]
-    assert fleet.rack_sums(np.arange(8)).tolist() == [6, 4, 18]
-    assert fleet.rack_sums(np.arange(8) > 2).tolist() == [1, 1, 3]
-    assert fleet.group_sums(fleet.per_group_servers()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
-
-
 def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:
     np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.01))
     matrix = [f"hall.recirculation.matrix_file={tmp_path / 'r.npz'}",
@@ -208,14 +179,6 @@ def test_rooms_hold_what_has_no_temperature_of_its_own() -> None:
         with Simulator(config, drivers=drivers) as sim:
             kj_per_k = j_per_k_w * config.rack_nameplate_w().sum() / 1e3
             assert sim.sizing.room_kwh_per_k * 3600 == pytest.approx(kj_per_k)
-
-
-def test_equal_halls_are_laid_out_once_and_equal() -> None:
-    fleet = build_fleet(make_configs(TINY, count=50))
-    assert fleet.size == 50
-    assert len({id(rows) for rows in fleet.group_rows}) == 1
-    per_rack = fleet.per_rack_servers().reshape(50, -1)
-    assert np.all(per_rack == per_rack[:1])
 
 
 # --- copies and sampling ------------------------------------------------------------------------

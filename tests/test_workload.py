@@ -6,7 +6,6 @@ import math
 from collections import deque
 from dataclasses import dataclass, field, fields
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -262,38 +261,6 @@ def test_work_older_than_the_array_is_kept_and_counted_at_its_end(model: str) ->
         queue = work.queue
     assert queue[0, -1] == 40
     assert work.oldest_age_steps[0] == work.mean_age_steps[0] == 5
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_batch_equals_each_data_center_alone(model: str) -> None:
-    rng = np.random.default_rng(3)
-    size = 7
-    given: dict[str, Any] = {
-        "flexible_share": rng.uniform(0, 1, size),
-        "max_utilisation": rng.choice([0.5, 0.9, 1.0], size),
-        "queue_limit": rng.choice([50.0, 300.0, np.inf], size),
-        "deadline_steps": rng.choice([4.0, 12.0, np.inf], size),
-    }
-    queues, single = np.zeros((size, LENGTH)), [np.zeros((1, LENGTH)) for _ in range(size)]
-    for _ in range(60):
-        demand, command = rng.uniform(0, 1, size), rng.uniform(-1, 1, size)
-        together = work_step(model, demand, command, queues, **given)
-        queues = together.queue
-        for i in range(size):
-            own = {name: values[i : i + 1] for name, values in given.items()}
-            alone = work_step(model, demand[i : i + 1], command[i : i + 1], single[i], **own)
-            single[i] = alone.queue
-            for name, value in vars(alone).items():
-                assert np.array_equal(value, getattr(together, name)[i : i + 1]), (i, name)
-
-
-def test_age_histogram_by_hand() -> None:
-    limits = Limits(1.0, 1.0, math.inf, math.inf)
-    queue = np.zeros((1, 30))
-    for demand in (0.1, 0.2, 0.3, 0.0, 0.05):
-        queue = one_step("fluid", queue, demand, -1.0, limits).queue
-    found = age_histogram(queue, np.array([0.0, 2.0, 3.0, 25.0, 99.0]))
-    np.testing.assert_allclose(found, [[5.0, 30.0, 30.0, 0.0, 0.0]], atol=1e-12)
 
 
 def test_due_work_runs_before_what_arrives() -> None:
