@@ -321,7 +321,7 @@ def starting(quick: bool) -> Iterator[Figure]:
 
 
 def optima(quick: bool) -> Iterator[Figure]:
-    """Known optima, from the import to the last run, in processes of their own."""
+    """Known optima, from the import to the last run, each in a new process."""
     every = ",".join(steps.SITES)
     cases = [("ny,ca", 2, None)] if quick else [(every, 31, 500.0), ("ny", 365, 1000.0)]
     for sites, days, at_most in cases:

@@ -1,4 +1,4 @@
-"""Measurements that need a process of their own, for benchmarks/bench.py.
+"""Measurements that need a new process, for benchmarks/bench.py.
 
     python benchmarks/fresh.py NAME ARGUMENTS
 

@@ -70,7 +70,7 @@ class DataSet:
     returns: pd.DataFrame
     """A row for each controller, that of idle commands first even where it is not in the data set,
     with ``episodes``, ``steps``, ``mean_return``, ``changed_commands`` (share of the commands that
-    the nearest action gives otherwise) and the sum of each quantity of infos."""
+    the nearest action changes) and the sum of each quantity of infos."""
 
     @property
     def best(self) -> str | None:

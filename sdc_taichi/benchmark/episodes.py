@@ -72,9 +72,9 @@ class Collection:
     days: int = DAYS_PER_WEEK
     """Length of an episode, in days, 1..7."""
     repeats: int = 1
-    """Episodes of each controller in each week, each with a seed of its own."""
+    """Episodes of each controller in each week, with different seeds."""
     seed: int = 0
-    """Seed of the first episode of week 0; every other has one of its own."""
+    """Seed of the first episode of week 0; those of other episodes follow from it."""
     agent: str | None = None
     """The one agent that acts; None is all agents together."""
     environment: Mapping[str, Any] = field(default_factory=dict)
@@ -186,7 +186,7 @@ class Episode:
     infos: dict[str, F64]
     """Quantities of each step by name, (T + 1,) each; the first, before any step, are 0."""
     changed_commands: float
-    """Share of the commands that the nearest action gives otherwise than the controller did."""
+    """Share of the commands that the nearest action changes."""
 
 
 def episodes(
@@ -202,7 +202,7 @@ def episodes(
         collection: what is collected.
         controller: one of its controllers, or another name.
         progress: progress callback; counts the steps of each batch.
-        stop: asked before every step; true ends the run.
+        stop: called before every step; true ends the run.
 
     Yields:
         Episodes in the order of ``collection.starts``; a few at a time are in memory.
@@ -244,7 +244,7 @@ class _Commander:
         return self._env.actions_of(self._commands)
 
     def changed(self, result: Mapping[str, Any]) -> F64:
-        """Share of its last commands that were carried out otherwise, (B,).
+        """Share of its last commands that differ from those carried out, (B,).
 
         Args:
             result: quantities of the step, (B,) each.
@@ -269,7 +269,7 @@ class FollowedOptimum:
         objective: quantity to minimise.
         agents: agents (load, cooling, battery) that the plan moves; the others are idle.
         progress: progress callback of solving.
-        stop: asked now and then while solving; true raises ``StoppedError``.
+        stop: called repeatedly while solving; true raises ``StoppedError``.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ def objective_of_optimum(name: str) -> Objective | None:
 
 
 class _Chance:
-    """Actions drawn evenly from the action space, from a stream of each environment's own.
+    """Actions drawn evenly from the action space, by a generator for each environment.
 
     Args:
         env: the environments.
@@ -344,7 +344,7 @@ class _Chance:
     def reset(self, starts: list[Start]) -> None:
         """Begin an episode of each environment."""
         for space, start in zip(self._spaces, starts, strict=True):
-            # Apart from the stream that the environment draws its events from.
+            # Differs from the seed of the environment, which draws its events.
             (seed,) = np.random.SeedSequence([start.seed, 1]).generate_state(1)
             space.seed(int(seed))
 

@@ -97,7 +97,8 @@ class Leaderboard:
     """Differences of rows, in points of the change against idle commands, with the probability of
     improvement: each row against the best rule, and against the row below it."""
     profiles: pd.DataFrame
-    """Share of weeks above given shares of the achievable, in %; empty without an optimum."""
+    """Share of weeks above thresholds of the share of the achievable, in %; empty without an
+    optimum."""
     coordination: pd.DataFrame
     """Savings of the agents of a row alone and together; empty where none ran alone."""
     apart: pd.DataFrame
@@ -324,7 +325,7 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
 def _apart(
     case: CaseResults, evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64]
 ) -> pd.DataFrame:
-    """Rows whose agents were trained together, against those trained apart and played together."""
+    """Rows whose agents were trained together, against those whose agents were trained alone."""
     import pandas as pd
 
     trained = {

@@ -89,7 +89,7 @@ def write_data_set(
         command: command line that makes it again, for the card.
         replace: whether a data set of that name is replaced.
         progress: progress callback ``(stage, done, total)``.
-        stop: asked before every step; true ends the work.
+        stop: called before every step; true ends the work.
 
     Raises:
         SdcError: Minari is missing, something is not valid, or a file cannot be written.

@@ -345,18 +345,18 @@ class ResultStore:
             )
         return None
 
-    def _continued(self, begun: Study, asked: Study) -> tuple[Study, tuple[str, ...]]:
+    def _continued(self, begun: Study, wanted: Study) -> tuple[Study, tuple[str, ...]]:
         """A study that goes on, with the jobs of both, and notes on it.
 
         Raises:
             ConfigError: their settings differ, which the error lists.
         """
-        before, now = _flat_settings(begun), _flat_settings(asked)
+        before, now = _flat_settings(begun), _flat_settings(wanted)
         different = [
             f"{name} {_setting_text(before, name)}, here {_setting_text(now, name)}"
             for name in {**before, **now}
             if (name in before, before.get(name)) != (name in now, now.get(name))
-            and not any(fnmatch(name, pattern) for pattern in asked.may_change)
+            and not any(fnmatch(name, pattern) for pattern in wanted.may_change)
         ]
         if different:
             more = len(different) - _MOST_DIFFERENCES
@@ -366,18 +366,18 @@ class ResultStore:
                 "or another folder"
             )
         notes: tuple[str, ...] = ()
-        if begun.source != asked.source:
+        if begun.source != wanted.source:
             notes = (
-                f"{self.folder}: results of other source files of version {asked.version} are "
+                f"{self.folder}: results of other source files of version {wanted.version} are "
                 "kept; a new folder has all from one source",
             )
         known = {tuple(partition.items()) for partition in begun.partitions}
-        added = [x for x in asked.partitions if tuple(x.items()) not in known]
+        added = [x for x in wanted.partitions if tuple(x.items()) not in known]
         changes = {
-            "command": asked.command if added else begun.command,
+            "command": wanted.command if added else begun.command,
             "partitions": [*begun.partitions, *added],
         }
-        return asked.model_copy(update=changes), notes
+        return wanted.model_copy(update=changes), notes
 
 
 def partition_path(partition: Mapping[str, str]) -> Path:

@@ -146,12 +146,12 @@ class _Task(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class _Made:
-    """The controller of a row, and how it was found."""
+    """The controller of a row, and how it was chosen or trained."""
 
     spec: str
     """Controller by name; empty for an optimum."""
     metrics: dict[str, Any]
-    """How it was found."""
+    """How it was chosen or trained, as metrics of the job."""
     files: dict[str, bytes]
     """Policies and curves of trainings by their paths."""
     agents: tuple[str, ...] = ()
@@ -305,7 +305,7 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
 
 
 def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]:
-    """Metrics of a row job: how its controller was found, and what it was run in."""
+    """Metrics of a row job: how its controller was chosen or trained, and its weeks."""
     return made.metrics | {
         "objective": str(weeks.objective),
         "unit": weeks.objective.unit,

@@ -118,7 +118,7 @@ class CaseResults:
     rows: Mapping[str, Sequence[RowResult]]
     """Results of each row by seed; rows in the order of the suite, submitted ones last."""
     missing: tuple[str, ...]
-    """Results that were asked for and do not exist, as ``ROW, seed SEED``."""
+    """Results of the study that do not exist yet, as ``ROW, seed SEED``."""
     bound: Mapping[tuple[str, int], float]
     """Bound of the figure by site and week, as far as it is known."""
     optima_core_s: float
@@ -318,12 +318,12 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
                 references.append(record)
             else:
                 _add(rows[case].setdefault(row, {}), read_result(store, record))
-    asked: dict[str, dict[tuple[str, int], None]] = {}
+    wanted: dict[str, dict[tuple[str, int], None]] = {}
     for partition in (x for study in studies for x in study.partitions):
         check_partition(partition)
         if not partition["row"].startswith(REFERENCE):
             pair = partition["row"], int(partition["seed"])
-            asked.setdefault(partition["case"], {})[pair] = None
+            wanted.setdefault(partition["case"], {})[pair] = None
     cases = {}
     for name, of_case in rows.items():
         if not of_case:
@@ -340,7 +340,7 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
             rows=results,
             missing=tuple(
                 f"{row}, seed {seed}"
-                for row, seed in asked.get(name, ())
+                for row, seed in wanted.get(name, ())
                 if seed not in of_case.get(row, {})
             ),
             bound=_bounds(solved),

@@ -44,7 +44,7 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
 
     Args:
         suite: the whole suite.
-        chosen: the suite with the cases, rows and seeds that are asked for.
+        chosen: the suite with the chosen cases, rows and seeds.
         command: command line that runs the suite, or goes on with it.
         quick: whether it is the quick form of a suite.
     """

@@ -94,7 +94,7 @@ class OffPolicySettings(ActingSettings):
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
     """Decisions of each data center between two updates."""
     gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 64
-    """Gradient steps of an update, each from a batch of its own."""
+    """Gradient steps of an update, each from a new batch."""
     batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
     """Transitions of a batch."""
     replay_size: Annotated[int, Field(strict=True, ge=1, le=100_000_000)] = 262_144

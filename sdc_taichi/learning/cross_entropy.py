@@ -213,7 +213,7 @@ def _figures(returns: F64, search: _Search) -> F64:
 
 
 def _scores(parameters: F32, seen: F32, search: _Search) -> F32:
-    """Scores of each data center by its own candidate, (B, m)."""
+    """Scores of each data center by the candidate that it tries, (B, m)."""
     scaled = ((seen - search.seen_mean) / search.seen_std).clip(-CLIP, CLIP).astype(np.float32)
     product = np.matmul(parameters[:, :, :-1], scaled[:, :, None])[..., 0]
     return np.asarray(product + parameters[:, :, -1])

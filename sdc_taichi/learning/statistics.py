@@ -59,7 +59,7 @@ def bootstrap_interval(
     Args:
         statistic: function of the samples.
         samples: samples that are paired by their weeks, (S, W) each, of any S.
-        strata: stratum of each week, (W,); weeks are drawn within their own.
+        strata: stratum of each week, (W,); weeks are drawn within their stratum.
         generator: draws.
         draws: number of draws.
         level: share of the draws inside the interval.
