@@ -27,7 +27,6 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import (
-    CONTROLLABLE,
     Controller,
     View,
     commands_of,
@@ -382,22 +381,6 @@ def test_an_object_is_copied(sim: Simulator) -> None:
     mine.lock = threading.Lock()  # type: ignore[attr-defined]
     with pytest.raises(ConfigError, match=r"AlwaysCharge: cannot be copied .*copy\.deepcopy"):
         make_controller(mine, sim.fleet)
-
-
-@pytest.mark.parametrize(
-    ("spec", "commands"),
-    [
-        ("g36", ("cooling",)),
-        ("constant:20", ("cooling",)),
-        ("greedy-ci", ("load", "battery")),
-        ("random", CONTROLLABLE),
-        ("mpc-24h:cost", CONTROLLABLE),
-        ("idle", ()),
-        ("load=greedy-ci, cooling=g36,battery=idle", ("load", "cooling")),
-    ],
-)
-def test_commands_of_a_spec(spec: str, commands: tuple[str, ...]) -> None:
-    assert commands_of(make_controller(spec, build_fleet(TINY))) == commands
 
 
 def test_trim_and_respond_gives_the_reference_sequence() -> None:

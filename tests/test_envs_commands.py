@@ -146,51 +146,41 @@ def test_one_learner_of_fans_alone_beside_rules() -> None:
     assert all(speed < 1 for speed in fan_speed(env.unwrapped))
 
 
-WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"agent_dx": ["fan"]}, "unknown agent 'agent_dx'; did you mean"),
-    ({"agent_dc": ["fans"]}, "agent_dc: 'fans'; did you mean 'fan'?"),
-    ({"agent_bat": ["fan"]}, "agent_bat: 'fan'; valid: battery"),
-    ({"agent_dc": []}, "agent_dc: []; valid is one or more, each once"),
-    ({"agent_dc": ["fan", "fan"]}, "valid is one or more, each once"),
-    (
-        {"agent_ls": ["placement"], "agent_dc": ["placement"]},
-        "placement is decided by two agents; valid is one",
-    ),
-]
-
-
-@pytest.mark.parametrize(("commands", "message"), WRONG)
-def test_commands_that_are_not_valid(commands: Any, message: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(message)):
-        sdc_taichi.parallel_env(CONTROLLED, commands=commands)
+CONTINUOUS: dict[str, Any] = {"actions": "continuous"}
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("commands", "options", "message"),
     [
+        ({"agent_dx": ["fan"]}, {}, "unknown agent 'agent_dx'; did you mean"),
+        ({"agent_dc": ["fans"]}, {}, "agent_dc: 'fans'; did you mean 'fan'?"),
+        ({"agent_bat": ["fan"]}, {}, "agent_bat: 'fan'; valid: battery"),
+        ({"agent_dc": []}, {}, "agent_dc: []; valid is one or more, each once"),
+        ({"agent_dc": ["fan", "fan"]}, {}, "valid is one or more, each once"),
         (
-            {"config": "corrected", "commands": {"agent_dc": ["fan"]}},
-            "commands: fan needs hvac.crac.flow_model=controlled; it is ",
+            {"agent_ls": ["placement"], "agent_dc": ["placement"]},
+            {},
+            "placement is decided by two agents; valid is one",
         ),
+        ({"agent_dc": ["fan"]}, {"config": "corrected"}, "fan needs hvac.crac.flow_model=control"),
         (
-            {"config": "corrected", "commands": {"agent_ls": ["placement"]}},
+            {"agent_ls": ["placement"]},
+            {"config": "corrected"},
             "commands: placement needs workload.placement=weights; it is uniform",
         ),
-        ({"agents": ["agent_bat"]}, "commands: without effect for agent_"),
-        ({"fan_change": 0.1}, "fan_change: without effect with actions discrete"),
+        (ALL["commands"], {"agents": ["agent_bat"]}, "commands: without effect for agent_"),
+        (ALL["commands"], {"fan_change": 0.1}, "fan_change: without effect with actions discrete"),
+        (None, {**CONTINUOUS, "fan_change": 0.1}, "without effect without the command fan"),
         (
-            {"actions": "continuous", "fan_change": 0.1, "commands": None},
-            "fan_change: without effect without the command fan",
-        ),
-        (
-            {"actions": "continuous", "setpoint_change_k": 1, "commands": {"agent_dc": ["fan"]}},
-            "setpoint_change_k: without effect without the command cooling",
+            {"agent_dc": ["fan"]},
+            {**CONTINUOUS, "setpoint_change_k": 1},
+            "without effect without the command cooling",
         ),
     ],
 )
-def test_commands_fit_the_config_and_other_options(options: dict[str, Any], message: str) -> None:
+def test_commands_that_are_not_valid(commands: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        sdc_taichi.parallel_env(**{**ALL, **options})
+        sdc_taichi.parallel_env(**{"config": CONTROLLED, **options, "commands": commands})
 
 
 def test_placement_needs_halls_of_as_many_racks() -> None:

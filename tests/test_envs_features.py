@@ -21,7 +21,6 @@ from sdc_taichi import (
     Simulator,
     drivers_from_arrays,
     load_config,
-    make_configs,
 )
 from sdc_taichi.control import PERFECT, ForecastError, View, view_maker
 from sdc_taichi.control.view import RandomWalks
@@ -292,46 +291,6 @@ def test_what_is_handed_out_belongs_to_the_caller() -> None:
             np.testing.assert_array_equal(array, kept[1][agent])
 
 
-# Nothing looks ahead
-
-
-def changed(drivers: Drivers, name: str, from_index: int) -> Drivers:
-    """Other values from ``from_index`` of the year on; design days stay."""
-    table: FleetSeries = getattr(drivers, name)
-    values = table.values.copy()
-    for offset, length in set(zip(table.offsets.tolist(), table.lengths.tolist(), strict=True)):
-        part = values[offset + from_index : offset + length]
-        part += 0.1 if name == "demand" else 5.0
-    if name == "demand":
-        values = np.minimum(values, 1.0)
-    other: dict[str, Any] = {name: replace(table, values=values)}
-    return replace(drivers, **other)
-
-
-@pytest.mark.parametrize("error", [ForecastError(), ForecastError(0.2, 3.0)])
-@pytest.mark.parametrize(
-    ("name", "lead_h"),
-    [("demand", 0.0), ("ci_g_per_kwh", 24.0), ("outdoor_c", 24.0), ("wet_bulb_c", 24.0)],
-)
-def test_nothing_beyond_the_longest_lead_is_seen(
-    name: str, lead_h: float, error: ForecastError
-) -> None:
-    configs = make_configs(load_config("tiny"), sites=SITES)
-    steps = 20
-    with Simulator(configs) as sim:
-        drivers = sim.drivers
-        if name == "wet_bulb_c":  # room for a warmer wet bulb
-            drivers = changed(drivers, "outdoor_c", 0)
-    last = steps + round(lead_h * 4)
-    seen, unseen, nearer = (
-        watch(configs, steps, inputs, error=error)[1]
-        for inputs in (drivers, changed(drivers, name, last + 1), changed(drivers, name, last))
-    )
-    for (_, _, a, _), (_, _, b, _) in zip(seen, unseen, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(seen[-1][2], nearer[-1][2])
-
-
 # Forecasts
 
 
@@ -480,9 +439,6 @@ def test_no_leads_leave_the_forecasts_out() -> None:
 def test_wrong_choices_name_what_is_valid(options: dict[str, Any], message: str) -> None:
     with Simulator([load_config("tiny")]) as sim, pytest.raises(ConfigError, match=message):
         Observer(sim.fleet, **options)
-
-
-# Several CRAC units
 
 
 # Heat map

@@ -330,9 +330,6 @@ def test_a_joint_learner_gets_one_value_for_all_once() -> None:
         ({"agent_ls": {"carbon": True}}, "carbon is True; valid is a number"),
         ({"agent_ls": ["carbon"]}, "valid is a dict of term to scale"),
         ({"carbon": 1.0}, "unknown agent 'carbon'; valid: agent_ls, agent_dc, agent_bat"),
-        (":f", "rewards ':f': unknown; valid: default"),
-        ("os:", "rewards 'os:': unknown"),
-        (".os:x", "rewards '.os:x': unknown"),
         (3, "rewards 3: unknown; valid: default, bill, paper, sustaindc"),
     ],
 )

@@ -146,17 +146,13 @@ def test_work_is_conserved_and_limits_hold(overrides: tuple[str, ...]) -> None:
         assert not column(kept, "throttled_racks").any()
 
 
-def test_preset_sustaindc_saves_carbon() -> None:
-    config = load_config("sustaindc", ["name=dc"])
-    kept, idle = (results(spec, config, 2 * DAY) for spec in ("mpc-24h", "idle"))
+@pytest.mark.parametrize("preset", [("sustaindc",), ("corrected", "simulation.thermal=transient")])
+def test_other_presets_save_carbon(preset: tuple[str, ...]) -> None:
+    config = load_config(preset[0], ["name=dc", *preset[1:]])
+    drivers = inputs() if preset[0] == "corrected" else None
+    kept, idle = (results(spec, config, DAY, drivers=drivers) for spec in ("mpc-24h", "idle"))
     assert column(kept, "carbon_g").sum() < column(idle, "carbon_g").sum()
     assert not column(kept, "overdue_tasks").any()
-
-
-def test_transient_halls_are_planned_on_quasi_steady_tables() -> None:
-    config = load_config("corrected", ["name=dc", "simulation.thermal=transient"])
-    kept, idle = (results(spec, config, DAY, drivers=inputs()) for spec in ("mpc-24h", "idle"))
-    assert column(kept, "carbon_g").sum() < column(idle, "carbon_g").sum()
 
 
 # What it depends on

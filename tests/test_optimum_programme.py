@@ -20,7 +20,7 @@ from sdc_taichi.optimum.problem import (
     Storage,
 )
 from sdc_taichi.optimum.stage_cost import stage_cost
-from sdc_taichi.optimum.tables import INLET_MARGIN_K, FacilityTable
+from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.types import F64
 
 CLC = Storage("clc", 100.0, 0.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
@@ -114,13 +114,6 @@ def test_a_battery_is_not_charged_and_discharged_at_once_and_never_beyond_its_li
     assert stored.min() > -1e-7
     assert stored.max() < 100.0
     assert found.discharge_kwh.max() > 1.0
-
-
-def test_an_inlet_limit_keeps_setpoints_down_and_never_lowers_the_bound() -> None:
-    p = problem()
-    limited = replace(p, inlet_limit_c=22.5)
-    assert bound(limited).figure > bound(p).figure
-    np.testing.assert_allclose(stage_cost(limited).setpoint_c, 20.5 + INLET_MARGIN_K)
 
 
 def test_work_that_cannot_be_done_is_told_with_the_name_of_the_data_center() -> None:

@@ -110,10 +110,12 @@ def test_every_kind_goes_on_from_what_was_saved(kind: str) -> None:
     env, other = MAKERS[kind](), MAKERS[kind]()
     env.reset(seed=2)
     play(env, STEPS)
-    saved = pickle.loads(pickle.dumps(env.state_dict()))
+    saved = env.state_dict()
+    pickled = pickle.dumps(saved)
     expected = play(env, STEPS)
+    assert pickle.dumps(saved) == pickled
     for _ in range(2):  # once more into one that is elsewhere
-        other.load_state_dict(saved)
+        other.load_state_dict(pickle.loads(pickled))
         assert equal(play(other, STEPS), expected)
 
 

@@ -59,14 +59,18 @@ class Controller(Protocol):
         """
 
 
-class Idle:
+class _WithoutMemory:
+    """Controllers whose commands depend on the view alone."""
+
+    def reset(self, seed: int | I64) -> None:
+        """Do nothing: no memory."""
+
+
+class Idle(_WithoutMemory):
     """Neutral commands: no work moves, the battery rests, setpoints hold or follow a schedule."""
 
     commands: tuple[str, ...] = ()
     """Fields of ``Actions`` that it gives."""
-
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Neutral commands."""
@@ -111,7 +115,7 @@ class Random:
         return [np.random.SeedSequence(pair) for pair in pairs]
 
 
-class TrimAndRespond:
+class TrimAndRespond(_WithoutMemory):
     """Supply setpoint by trim and respond of ASHRAE Guideline 36 (2021), section 5.1.14.
 
     Every 5 min the setpoint rises a little, or falls if racks request cooling. A step of 15 min
@@ -121,9 +125,6 @@ class TrimAndRespond:
 
     commands = ("cooling",)
     """Fields of ``Actions`` that it gives."""
-
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing: the setpoint is part of the simulator's state."""
 
     def act(self, view: View) -> Actions:
         """Setpoint command alone."""
@@ -145,7 +146,7 @@ class TrimAndRespond:
         return Actions(cooling=setpoint_command(target_c, view))
 
 
-class FixedSetpoint:
+class FixedSetpoint(_WithoutMemory):
     """Constant setpoint, reached with the first command.
 
     Args:
@@ -158,9 +159,6 @@ class FixedSetpoint:
     def __init__(self, setpoint_c: float | str) -> None:
         self._setpoint_c = setpoint_c
 
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
-
     def act(self, view: View) -> Actions:
         """Setpoint command alone."""
         if self._setpoint_c == "low":
@@ -172,7 +170,7 @@ class FixedSetpoint:
         return Actions(cooling=setpoint_command(target_c, view))
 
 
-class Lookahead:
+class Lookahead(_WithoutMemory):
     """Battery that charges and discharges by the forecast carbon intensity of a coming window.
 
     It charges at full power if the present intensity is in the lowest quarter of the window and
@@ -190,9 +188,6 @@ class Lookahead:
     def __init__(self, hours: float) -> None:
         self._hours = hours
 
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
-
     def act(self, view: View) -> Actions:
         """Battery command alone."""
         ci = view.forecast(self._hours).ci_g_per_kwh
@@ -200,7 +195,7 @@ class Lookahead:
         return Actions(battery=np.where(pays, quartile_command(ci), 0.0))
 
 
-class GreedyCarbon:
+class GreedyCarbon(_WithoutMemory):
     """Work and battery by the present carbon intensity relative to the mean of a coming window.
 
     Above the mean, work is deferred and the battery discharges; below it, the queue drains and the
@@ -215,9 +210,6 @@ class GreedyCarbon:
 
     def __init__(self, hours: float = 24.0) -> None:
         self._hours = hours
-
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Commands for work and battery."""

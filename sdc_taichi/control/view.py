@@ -226,7 +226,7 @@ class View:
     state: State
     """State before the step to come."""
     drivers: Drivers
-    """Inputs of all steps; whoever reads those of later steps sees the future."""
+    """Inputs of all steps; those of later steps are the future, without errors of forecasts."""
     fleet: Fleet
     """The data centers, with their configs."""
     sizing: Sizing

@@ -130,7 +130,6 @@ class Core:
         self._commands_of_others = commands_by_others(
             self.agents, learned, commands_of(self._others)
         )
-        self._others_act = bool(self._commands_of_others)
         self._learned_commands = learned
         self._rewards = Rewards(
             options.rewards,
@@ -272,7 +271,7 @@ class Core:
         if self.episode_over:
             raise RuntimeStateError("the episode is over; call reset() first")
         commands = self._decoder.decode(actions, view.state)
-        if self._others_act:
+        if self._commands_of_others:
             by_others = self._others.act(view)
             for name in self._commands_of_others:
                 command = getattr(by_others, name)

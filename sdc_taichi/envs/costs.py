@@ -76,7 +76,7 @@ class Costs:
     """Costs of the option ``costs``.
 
     Args:
-        given: names, functions or import paths, or a dict from them to weights; None for no costs.
+        costs: names, functions or import paths, or a dict from them to weights; None for no costs.
         fleet: the data centers.
 
     Raises:
@@ -84,10 +84,10 @@ class Costs:
             always 0.
     """
 
-    def __init__(self, given: Any, fleet: Fleet) -> None:
+    def __init__(self, costs: Any, fleet: Fleet) -> None:
         self._functions: dict[str, CostFunction] = {}
         self._weights: dict[str, float] = {}
-        for cost, weight in _with_weights(given):
+        for cost, weight in _with_weights(costs):
             name, function = _named(cost)
             if name in self._functions:
                 raise ConfigError(f"costs: {name!r} is named twice")
@@ -140,34 +140,34 @@ def costs_markdown() -> str:
     return "\n".join(["| cost | of a step |", "|---|---|", *rows])
 
 
-def _with_weights(given: Any) -> list[tuple[Any, Any]]:
+def _with_weights(costs: Any) -> list[tuple[Any, Any]]:
     """Costs and their weights; without weights each is 1."""
-    if given is None:
+    if costs is None:
         return []
-    if isinstance(given, Mapping) and given:
-        return list(given.items())
-    if isinstance(given, Sequence) and not isinstance(given, str | bytes) and given:
-        return [(cost, 1.0) for cost in given]
+    if isinstance(costs, Mapping) and costs:
+        return list(costs.items())
+    if isinstance(costs, Sequence) and not isinstance(costs, str | bytes) and costs:
+        return [(cost, 1.0) for cost in costs]
     raise ConfigError(
-        f"costs {shortened(given)}: valid is None, a list of costs, or a dict of cost to weight; "
+        f"costs {shortened(costs)}: valid is None, a list of costs, or a dict of cost to weight; "
         f"costs are {', '.join([*COSTS, *_registered])}, functions, and import paths module:name"
     )
 
 
-def _named(given: Any) -> tuple[str, CostFunction]:
+def _named(cost: Any) -> tuple[str, CostFunction]:
     """Name and function of a cost."""
-    if not callable(given):
+    if not callable(cost):
         function = function_named(
-            "cost", given, COSTS | _registered, valid=", ".join([*COSTS, *_registered])
+            "cost", cost, COSTS | _registered, valid=", ".join([*COSTS, *_registered])
         )
-        return str(given).rpartition(":")[2], function
-    name = getattr(given, "__name__", type(given).__name__)
+        return str(cost).rpartition(":")[2], function
+    name = getattr(cost, "__name__", type(cost).__name__)
     if not name.isidentifier():
         raise ConfigError(
-            f"cost {import_path(given)}: has no name; valid is a function with a name, or one that "
+            f"cost {import_path(cost)}: has no name; valid is a function with a name, or one that "
             "register_cost gave a name"
         )
-    return name, given
+    return name, cost
 
 
 def _checked_weight(name: str, weight: Any) -> float:

@@ -22,8 +22,8 @@ from sdc_taichi.sim.step_inputs import MOST_MOVES
 from sdc_taichi.types import F64, I64, State
 
 Seed = int | Sequence[int | None] | I64 | None
-"""Seed of environment 0, to which environment i adds i; or one for each environment, of which None
-goes on with the generator that is there; or None for all."""
+"""Seed of environment 0, to which environment i adds i; or one for each environment, where None
+continues its present generator; or None for all."""
 
 
 def seeded_generators(

@@ -12,7 +12,7 @@ and its decorator gives unit and range. Nothing else needs to know it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any, NamedTuple, TypeVar
@@ -169,28 +169,18 @@ FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
 """Feature that an agent observes by default because it decides a command."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Declared:
-    """A feature as its function declares it, before its size is known."""
-
-    value: Callable[[Any], Any]
-    unit: str
-    low: float
-    high: float
-    size: int | Callable[[Layout], int]
-
-
-_TIME: dict[str, _Declared] = {}
-_MEASURED: dict[str, _Declared] = {}
-_OF_RACKS: dict[str, _Declared] = {}
+_Size = int | Callable[[Layout], int]
+"""Number of entries of a feature, or a function that returns it; there is no feature where it is
+0."""
+_Kind = dict[str, tuple[Feature, _Size]]
+"""Features with the same kind of inputs, before their sizes are known, by name."""
+_TIME: _Kind = {}
+_MEASURED: _Kind = {}
+_OF_RACKS: _Kind = {}
 
 
 def _feature(
-    kind: dict[str, _Declared],
-    unit: str,
-    low: float,
-    high: float,
-    size: int | Callable[[Layout], int] = 1,
+    kind: _Kind, unit: str, low: float, high: float, size: _Size = 1
 ) -> Callable[[_Value], _Value]:
     """Declare the feature of a function's name; its docstring describes it.
 
@@ -199,27 +189,28 @@ def _feature(
         unit: unit of the value.
         low: lower end of the range.
         high: upper end of the range.
-        size: number of entries; there is no feature where it is 0.
+        size: number of entries.
     """
 
     def declare(function: _Value) -> _Value:
-        kind[function.__name__] = _Declared(function, unit, low, high, size)
+        name, text = function.__name__, function.__doc__ or ""
+        kind[name] = Feature(name, unit, low, high, text, value=function), size
         return function
 
     return declare
 
 
-def _features_of(kind: Mapping[str, _Declared], layout: Layout) -> tuple[Feature, ...]:
+def _features_of(kind: _Kind, layout: Layout) -> tuple[Feature, ...]:
     ci, weather = (
         ", ".join(f"{h:g}" for h in leads) for leads in (layout.ci_leads_h, layout.weather_leads_h)
     )
-    out = []
-    for name, x in kind.items():
-        size = x.size(layout) if callable(x.size) else x.size
-        if size:
-            text = (x.value.__doc__ or "").format(ci_leads=ci, weather_leads=weather)
-            out.append(Feature(name, x.unit, x.low, x.high, text, size, x.value))
-    return tuple(out)
+    features = []
+    for feature, size in kind.values():
+        entries = size(layout) if callable(size) else size
+        if entries:
+            text = feature.description.format(ci_leads=ci, weather_leads=weather)
+            features.append(replace(feature, size=entries, description=text))
+    return tuple(features)
 
 
 def time_features(layout: Layout) -> tuple[Feature, ...]:

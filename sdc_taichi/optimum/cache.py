@@ -1,4 +1,4 @@
-"""What is known of the optimum of one data center, and the file that keeps it."""
+"""Entries of the cache of optima, one file for each data center."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OptimumCacheWarning(SdcWarning):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What is known of the optimum of one data center over T steps."""
+    """Optimum of one data center over T steps, as the cache keeps it."""
 
     idle: float
     """Figure under idle commands."""
@@ -44,11 +44,11 @@ class Entry:
     alone: Mapping[str, float]
     """Lowest figure reached with one agent alone, by its name."""
     kind: str
-    """What the bound is: ``bound``, or ``estimate: `` or ``none: `` and why."""
+    """Kind of the bound: ``bound``, or ``estimate: `` or ``none: `` and why."""
     failures: tuple[str, ...]
     """Certificates that do not hold, in words."""
     certificate: Mapping[str, float]
-    """What the simulator measured along the achieved path, by name."""
+    """Measurements of the simulator along the achieved path, by name."""
     load: F64
     """Load commands of the achieved path, (T,)."""
     cooling: F64
@@ -76,7 +76,7 @@ class Cache:
     keeps nothing, each with an ``OptimumCacheWarning``.
 
     Args:
-        folder: Where the files are.
+        folder: Folder of the files; None is ``usual_folder``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -86,7 +86,7 @@ class Cache:
         """The entry of a key; None where there is none that can be used.
 
         Args:
-            key: What ``key_of`` returned.
+            key: Key of ``key_of``.
             steps: Number of steps, T.
         """
         return self._read(
@@ -101,7 +101,7 @@ class Cache:
         """Bounds with given ends that are kept under a key.
 
         Args:
-            key: What ``key_of`` returned.
+            key: Key of ``key_of``.
         """
 
         def figures(arrays: Mapping[str, Any]) -> dict[Ends, float]:
@@ -116,7 +116,7 @@ class Cache:
         """Keep bounds with given ends, whole or not at all.
 
         Args:
-            key: What ``key_of`` returned.
+            key: Key of ``key_of``.
             figures: The bounds.
         """
         ends = np.array([astuple(each) for each in figures])

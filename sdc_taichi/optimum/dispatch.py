@@ -39,7 +39,7 @@ from sdc_taichi.plant.battery import BATTERIES, BatteryPoint
 from sdc_taichi.types import F64, I64
 
 DEFER, DRAIN, DUE = -1, 1, 0
-"""What a step of a plan does with its queue: add work, take work out, or both with due work."""
+"""Mode of a step of a plan: work enters the queue, leaves it, or due work leaves it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +104,8 @@ class DispatchProgramme:
     """The linear programme of some steps.
 
     Args:
-        problem: What is to be planned.
-        stage: The least cost of its steps.
+        problem: The planning problem.
+        stage: Least cost of its steps.
         curves: Cost and energy of its steps by the work done.
         span: The steps.
     """
@@ -375,7 +375,7 @@ _UNLIMITED_KW = 1e12
 
 @dataclass(frozen=True, slots=True)
 class BatteryLimits:
-    """What a battery can do in a step, as the least of linear functions of the energy stored."""
+    """Limits of a battery in a step, each the least of linear functions of the energy stored."""
 
     charge_efficiency: float
     """Energy stored per energy drawn."""

@@ -1,4 +1,4 @@
-"""What a step costs by weather, utilisation and setpoint, for plans on weather that is foreseen.
+"""Energy of a step by weather, utilisation and setpoint, for plans on forecast weather.
 
 A table holds the weather of each step. A forecast may be wrong, so a map has nodes throughout the
 weather of the year and is interpolated linearly between them.
@@ -43,7 +43,7 @@ _BARRED = 1e6
 
 @dataclass(frozen=True, slots=True)
 class FacilityMap:
-    """What a step costs in B data centers, M of which differ, by weather, load and setpoint.
+    """Energy of a step of B data centers, M of which differ, by weather, load and setpoint.
 
     The first axis of the weather is the wet bulb where heat goes to a tower, else the dry bulb; the
     second is the dry bulb less the wet bulb. Weather beyond the nodes is read at the last ones.
@@ -267,7 +267,7 @@ def _weather_nodes(
 
 
 def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -> Hashable:
-    """What the map of a data center follows from."""
+    """Values that decide the map of a data center."""
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, float(inlet_limit_c[dc])

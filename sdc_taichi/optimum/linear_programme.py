@@ -1,9 +1,26 @@
-"""The bound of a planning problem, and a plan that queue and battery can carry out."""
+"""The bound of a planning problem, and a plan that queue and battery can carry out.
+
+Many weeks are bounded and planned window by window. The bound of all steps is at least the sum of
+the bounds of windows of steps, each with any state at its borders, of
+
+    cost of the steps - sum over borders of price * (state that the window leaves or starts from)
+
+for any prices: the terms that the windows on both sides of a border add cancel (Lagrangian
+relaxation; A. M. Geoffrion, "Lagrangean relaxation for integer programming", Mathematical
+Programming Study 2 (1974)). The better the prices, the less is lost; here they are the dual prices
+of programmes that span the borders, without demand charges.
+
+Where the last step has to keep the state of an earlier one, a price of at least 0 on the difference
+replaces the condition. Work that crosses a border loses its age, which can only lower the bound.
+A month in several windows is charged in each for its highest power there, with the window's share
+of the month as weight: the highest power of the month is at least this mean.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +36,6 @@ from sdc_taichi.optimum.stage_cost import (
     stage_cost,
     step_weights,
 )
-from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
 from sdc_taichi.types import I64
 
 _WARM_UP_SHARE = 1e-3
@@ -49,7 +65,7 @@ def bound(
     and battery are those of ``dispatch``.
 
     Args:
-        problem: What is to be planned.
+        problem: The planning problem.
         ends: State at the first scored step and at the end; the result then has scored steps
             alone. By default the state before the first step is that of the problem, and the end
             keeps at least the stored energy and at most the queue of the first scored step.
@@ -72,8 +88,8 @@ def bound(
 
     if span.end - span.first <= _LONGEST_BOUND:
         return solve(problem, stage, span)
-    borders = window_ends(problem, span.first, _LONGEST_BOUND)
-    return bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
+    borders = _window_ends(problem, span.first, _LONGEST_BOUND)
+    return _bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
 
 
 def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispatch:
@@ -85,7 +101,7 @@ def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispa
     window, with the peaks of the bound where there is a demand charge.
 
     Args:
-        problem: What is to be planned.
+        problem: The planning problem.
         check: Called before every window; an error that it raises ends the work.
 
     Raises:
@@ -115,8 +131,8 @@ def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispa
         if span.as_after is not None:
             prices = (span.as_after, -relaxed.end_task_price, relaxed.end_kwh_price)
             span = replace(span, state_values=(prices,))
-    borders = window_ends(problem, 0, longest)
-    return plan_in_windows(weighed, stage, span, borders, ahead, solve)
+    borders = _window_ends(problem, 0, longest)
+    return _plan_in_windows(weighed, stage, span, borders, ahead, solve)
 
 
 def _curves(problem: Problem, stage: StageCost) -> LoadCurves:
@@ -148,11 +164,11 @@ def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: 
     late = 2.0 - np.arange(steps) / steps
     relaxed.add_deferral_weight(_DEFERRAL_WEIGHT * of_task * late)
     first = _solve(problem, relaxed)
-    found = [
+    by_modes = [
         restricted(_modes(problem, span, first)),
         restricted(_queue_modes(problem, span, first)),
     ]
-    plans = [each for each in found if each is not None]
+    plans = [each for each in by_modes if each is not None]
     if not plans:
         # Work that waits already may be due in a step that was to defer; draining always goes.
         drained = restricted(np.full(steps, DRAIN))
@@ -181,11 +197,11 @@ def _span(problem: Problem, ends: Ends | None) -> Span:
     return Span(0, problem.steps, start_kwh=stored, start_tasks=0.0, end_kwh=stored, end_tasks=0.0)
 
 
-def _modes(problem: Problem, span: Span, found: Dispatch) -> I64:
-    """I64 that allow about what a dispatch does in each step."""
+def _modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
+    """Mode of each step, (n,), that allows about what a dispatch does in it."""
     steps = problem.work.deadline_steps
     assert steps is not None
-    entered, waiting = found.deferred_tasks, found.waiting_tasks
+    entered, waiting = dispatch.deferred_tasks, dispatch.waiting_tasks
     start = span.start_tasks or 0.0
     left = entered - np.diff(waiting, prepend=start)
     before = np.zeros(steps) if span.deferred_before is None else span.deferred_before
@@ -198,8 +214,8 @@ def _modes(problem: Problem, span: Span, found: Dispatch) -> I64:
     return np.where(due & (entered > _NEGLIGIBLE_TASKS), DUE, modes)
 
 
-def _queue_modes(problem: Problem, span: Span, found: Dispatch) -> I64:
-    """I64 of a queue that is asked to do the work of a dispatch, as far as it can."""
+def _queue_modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
+    """Mode of each step, (n,), of a queue that does the work of a dispatch as far as it can."""
     work, steps = problem.work, problem.work.deadline_steps
     assert steps is not None
     arrived = work.arrived_tasks[span.first : span.end]
@@ -213,7 +229,7 @@ def _queue_modes(problem: Problem, span: Span, found: Dispatch) -> I64:
     for t in range(len(arrived)):
         waiting = total - total_out
         due = max(total_in[t] - total_out, 0.0)
-        change = found.executed_tasks[t] - arrived[t]
+        change = dispatch.executed_tasks[t] - arrived[t]
         out = min(max(due, change), waiting)
         into = min(max(out - change, 0.0), most[t])
         if into > _NEGLIGIBLE_TASKS:
@@ -239,3 +255,235 @@ def _solve(problem: Problem, programme: DispatchProgramme) -> Dispatch:
             f"at least the stored energy and at most the queue that are asked for; valid are data "
             f"centers that can, see workload.max_utilisation and workload.deadline_h"
         ) from None
+
+
+_BY_STEP = (
+    "executed_tasks",
+    "waiting_tasks",
+    "deferred_tasks",
+    "charge_kwh",
+    "discharge_kwh",
+    "stored_kwh",
+    "task_price",
+    "kwh_price",
+)
+"""Fields of ``Dispatch`` with a value for each step."""
+Solve = Callable[[Problem, StageCost, Span], Dispatch]
+"""The best dispatch found of some steps of a problem."""
+
+
+def _window_ends(problem: Problem, first: int, longest: int) -> list[int]:
+    """First steps after each window of a problem's steps.
+
+    Windows are about equal in length, and end where a month with a demand charge does.
+
+    Args:
+        problem: The planning problem.
+        first: First step of the first window.
+        longest: Most steps of a window between the ends of months.
+    """
+    months = sorted({m.end for m in problem.months if first < m.end < problem.steps})
+    ends: list[int] = []
+    for begin, end in zip([first, *months], [*months, problem.steps], strict=True):
+        count = -(-(end - begin) // longest)
+        ends += [begin + (end - begin) * (k + 1) // count for k in range(count)]
+    return ends
+
+
+def _bound_in_windows(
+    problem: Problem, stage: StageCost, span: Span, ends: list[int], around: int, solve: Solve
+) -> Dispatch:
+    """Bound of a span by windows, as if it were one dispatch.
+
+    Args:
+        problem: The planning problem.
+        stage: Least cost of its steps.
+        span: The steps.
+        ends: First steps after each window; the last is the end of the span.
+        around: Steps on both sides of a border of the programmes that give its prices.
+        solve: solves the programme of a span.
+    """
+    prices = {
+        end - 1: _border_prices(problem, stage, span, (end - 1, end - 1), around, solve)
+        for end in ends[:-1]
+    }
+    held: dict[int, tuple[float, float]] = {}
+    task = kwh = 0.0
+    if span.as_after is not None:
+        pair = (span.end - 1, span.as_after)
+        task, kwh = _border_prices(problem, stage, span, pair, around, solve)
+        task, kwh = max(task, 0.0), max(kwh, 0.0)
+        held = {span.end - 1: (task, kwh), span.as_after: (-task, -kwh)}
+    parts = []
+    for begin, end in zip([span.first, *ends[:-1]], ends, strict=True):
+        inside = replace(
+            span,
+            first=begin,
+            end=end,
+            as_after=None,
+            state_values=_state_values(prices, held, begin, end),
+        )
+        if begin > span.first:
+            inside = replace(inside, start_kwh=None, start_tasks=None, deferred_before=None)
+        if end < span.end:
+            inside = replace(inside, end_kwh=None, end_tasks=None)
+        parts.append(solve(_with_part_of_months(problem, begin, end), stage, inside))
+    return replace(_joined(parts), end_task_price=task, end_kwh_price=kwh)
+
+
+def _plan_in_windows(
+    problem: Problem, stage: StageCost, span: Span, ends: list[int], ahead: int, solve: Solve
+) -> Dispatch:
+    """Plan of a span by windows that each start from the state that the last has left.
+
+    Args:
+        problem: The planning problem.
+        stage: Least cost of its steps.
+        span: The steps; ``deferred_before`` is known.
+        ends: First steps after each window; the last is the end of the span.
+        ahead: Steps after a window that its programme looks ahead.
+        solve: finds a plan of a span.
+    """
+    parts: list[Dispatch] = []
+    state, first = span, span.first
+    end_kwh, end_tasks = span.end_kwh, span.end_tasks
+    for end in ends:
+        until = min(end + ahead, span.end)
+        last = until == span.end
+        within = span.as_after is not None and first <= span.as_after
+        dispatch = solve(
+            problem,
+            stage,
+            replace(
+                state,
+                first=first,
+                end=until,
+                end_kwh=end_kwh if last else None,
+                end_tasks=end_tasks if last else None,
+                as_after=span.as_after if last and within else None,
+            ),
+        )
+        window = _first_steps(dispatch, end - first)
+        parts.append(window)
+        if within and span.as_after is not None and span.as_after < end:
+            at = span.as_after - first
+            end_kwh, end_tasks = float(window.stored_kwh[at]), float(window.waiting_tasks[at])
+        before = state.deferred_before
+        state = replace(
+            state,
+            start_kwh=float(window.stored_kwh[-1]),
+            start_tasks=float(max(window.waiting_tasks[-1], 0.0)),
+            deferred_before=None
+            if before is None
+            else np.concatenate([before, window.deferred_tasks])[-len(before) :],
+        )
+        first = end
+    return _joined(parts)
+
+
+def _border_prices(
+    problem: Problem,
+    stage: StageCost,
+    span: Span,
+    border: tuple[int, int],
+    around: int,
+    solve: Solve,
+) -> tuple[float, float]:
+    """Cost of a task that waits at a border, and value of a kWh that is stored there.
+
+    Args:
+        problem: The planning problem.
+        stage: Least cost of its steps.
+        span: All steps.
+        border: The step before the border and the one whose end is the border's other side, which
+            for the end that keeps the state of an earlier step is this step.
+        around: Steps on both sides of the border to take into account.
+        solve: solves the programme of a span.
+    """
+    before, after = border
+    left = np.arange(max(before + 1 - around, span.first), before + 1)
+    right = np.arange(after + 1, min(after + 1 + around, span.end))
+    steps = np.concatenate([left, right])
+    part = Span(0, len(steps), start_kwh=span.start_kwh, start_tasks=span.start_tasks)
+    dispatch = solve(_taken(problem, steps), _taken_stage(stage, steps), part)
+    return float(dispatch.task_price[len(left) - 1]), float(dispatch.kwh_price[len(left) - 1])
+
+
+def _with_part_of_months(problem: Problem, begin: int, end: int) -> Problem:
+    """A problem whose months weigh as much as the part of them between two steps."""
+    months = []
+    for month in problem.months:
+        covered = max(min(month.end, end) - max(month.first, begin), 0)
+        weight = month.weight_per_kw * covered / (month.end - month.first)
+        months.append(replace(month, weight_per_kw=weight))
+    return replace(problem, months=tuple(months))
+
+
+def _state_values(
+    prices: dict[int, tuple[float, float]],
+    held: dict[int, tuple[float, float]],
+    begin: int,
+    end: int,
+) -> tuple[tuple[int, float, float], ...]:
+    """Costs of states at the ends of steps of a window: step, of a task, of a kWh.
+
+    Args:
+        prices: Price of a task and value of a kWh at the end of the last step of each window.
+        held: The same of steps whose states are held against each other.
+        begin: First step of the window.
+        end: First step after it.
+    """
+    values = [(step, task, -kwh) for step, (task, kwh) in held.items() if begin <= step < end]
+    if end - 1 in prices:
+        task, kwh = prices[end - 1]
+        values.append((end - 1, task, -kwh))
+    if begin - 1 in prices:
+        task, kwh = prices[begin - 1]
+        values.append((begin - 1, -task, kwh))
+    return tuple(values)
+
+
+def _taken(problem: Problem, steps: I64) -> Problem:
+    """A problem of some steps of another, in the order given, without what lies outside."""
+    work = problem.work
+    return replace(
+        problem,
+        kwh_weight=problem.kwh_weight[steps],
+        months=(),
+        work=replace(
+            work,
+            arrived_tasks=work.arrived_tasks[steps],
+            idle_tasks=work.idle_tasks[steps],
+            most_deferred_tasks=work.most_deferred_tasks[steps],
+            most_executed_tasks=work.most_executed_tasks[steps],
+        ),
+        idle_setpoint_c=problem.idle_setpoint_c[steps],
+        scored_from=0,
+    )
+
+
+def _taken_stage(stage: StageCost, steps: I64) -> StageCost:
+    """Least cost of some steps."""
+    return replace(
+        stage,
+        **{
+            f.name: getattr(stage, f.name)[steps]
+            for f in fields(StageCost)
+            if f.name != "executed_tasks"
+        },
+    )
+
+
+def _first_steps(dispatch: Dispatch, count: int) -> Dispatch:
+    """The first steps of a dispatch."""
+    return replace(dispatch, **{name: getattr(dispatch, name)[:count] for name in _BY_STEP})
+
+
+def _joined(parts: list[Dispatch]) -> Dispatch:
+    """Dispatches of windows end to end; the figure is the sum of theirs."""
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in _BY_STEP
+    }
+    joined["figure"] = sum(part.figure for part in parts)
+    joined["peaks_kw"] = tuple(np.max([part.peaks_kw for part in parts], axis=0).tolist())
+    return replace(parts[-1], **joined)

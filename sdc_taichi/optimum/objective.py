@@ -1,4 +1,4 @@
-"""What a plan minimises, and the figure of a run under it."""
+"""Objectives of plans, and the figure of a run under an objective."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ class Objective:
         valid = [f.name for f in fields(cls)]
         weights: dict[str, float] = {}
         for part in text.split("+"):
-            found = _TERM.fullmatch(part.strip())
-            name = found["name"].strip() if found else part.strip()
-            if found is None or name not in valid:
+            term = _TERM.fullmatch(part.strip())
+            name = term["name"].strip() if term else part.strip()
+            if term is None or name not in valid:
                 meant = suggestion(name, valid, " (did you mean {!r}?)")
                 raise ConfigError(
                     f"objective {text!r}: {part.strip()!r}; valid are {', '.join(valid)}, and sums "
@@ -72,10 +72,10 @@ class Objective:
             if name in weights:
                 raise ConfigError(f"objective {text!r}: {name} is given twice; valid is each once")
             try:
-                weights[name] = parse_number(found["weight"]) if found["weight"] else 1.0
+                weights[name] = parse_number(term["weight"]) if term["weight"] else 1.0
             except ValueError:
                 raise ConfigError(
-                    f"objective {text!r}: weight {found['weight']!r} is no number"
+                    f"objective {text!r}: weight {term['weight']!r} is no number"
                 ) from None
         return cls(**weights)
 
@@ -126,10 +126,10 @@ def _shortest(weight: float) -> str:
 
 
 class Score:
-    """What the scored steps of B data centers come to.
+    """Sums and extremes of the scored steps of B data centers.
 
     Args:
-        objective: what is minimised.
+        objective: objective that the figure counts.
         sim: the simulator, which has been reset and has done no step.
         scored_from: first step that counts.
     """

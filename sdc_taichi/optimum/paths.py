@@ -41,7 +41,7 @@ _STORED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
-    """What each path of a data center moves, by its name.
+    """Agents that each path of a data center moves, by its name.
 
     There is that of idle commands, one for each agent alone, and one for all of them together.
 
@@ -63,7 +63,7 @@ def path_of(
 
     Args:
         problem: The planning problem.
-        agents: What the path may move.
+        agents: Agents that the path may move.
         check: Called before every linear programme; an error that it raises ends the work.
 
     Raises:
@@ -144,10 +144,10 @@ def _stored_kwh(problem: Problem, facility_kwh: F64) -> F64:
     storage = problem.storage
     if storage.model == "released":
         return _released_kwh(problem, facility_kwh)
-    found = plan(replace(problem, agents=("battery",), table=_known_facility(facility_kwh)))
+    battery = plan(replace(problem, agents=("battery",), table=_known_facility(facility_kwh)))
     rise_kwh = (
-        storage.charge_efficiency * found.charge_kwh
-        - storage.discharge_factor * found.discharge_kwh
+        storage.charge_efficiency * battery.charge_kwh
+        - storage.discharge_factor * battery.discharge_kwh
     )
     return np.clip(storage.stored_kwh + np.cumsum(rise_kwh), 0.0, storage.capacity_kwh)
 
@@ -273,7 +273,7 @@ LEVELS = 201
 COMMANDS = np.linspace(-1.0, 1.0, 21)
 """Battery commands among which a step chooses."""
 BatteryModel = Callable[[F64, F64, F64 | float], BatteryResult]
-"""What a step does, from the energy stored, a command, and the energy of the facility, in kWh."""
+"""Result of a step from the energy stored, a command, and the energy of the facility, in kWh."""
 _SHORTAGE_FACTOR = 10.0
 """Price of a kWh that is missing at the end, relative to the highest price of a kWh delivered."""
 
@@ -319,8 +319,8 @@ def battery_path(
     values = np.empty((steps + 1, LEVELS))
     values[steps] = missing_price * np.maximum(end_kwh - levels, 0.0)
     for t in range(steps - 1, -1, -1):
-        found = run(levels[:, None], COMMANDS, facility_kwh[t])
-        options = cost(t, found.grid_kwh) + np.interp(found.stored_kwh, levels, values[t + 1])
+        result = run(levels[:, None], COMMANDS, facility_kwh[t])
+        options = cost(t, result.grid_kwh) + np.interp(result.stored_kwh, levels, values[t + 1])
         values[t] = options.min(axis=1)
     return _follow(storage, facility_kwh, values, levels, run, cost, step_h, end_kwh)
 
@@ -381,8 +381,8 @@ def _follow(
             capacity_kwh=capacity,
             parameters=parameters,
         )
-        found = run(stored, np.concatenate([fine, exact, np.zeros(1)]), load_kwh)
-        options = cost(t, found.grid_kwh) + np.interp(found.stored_kwh, levels, values[t + 1])
-        stored = found.stored_kwh[[int(options.argmin())]]
+        result = run(stored, np.concatenate([fine, exact, np.zeros(1)]), load_kwh)
+        options = cost(t, result.grid_kwh) + np.interp(result.stored_kwh, levels, values[t + 1])
+        stored = result.stored_kwh[[int(options.argmin())]]
         path[t] = stored[0]
     return path

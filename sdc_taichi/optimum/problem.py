@@ -27,7 +27,7 @@ from sdc_taichi.types import F64, I64
 
 Agent = Literal["load", "cooling", "battery"]
 AGENTS: tuple[Agent, ...] = ("load", "cooling", "battery")
-"""What a plan may move, by the names of the fields of ``Actions``."""
+"""Agents that a plan may move, by the names of the fields of ``Actions``."""
 RAMP_K = 2.0
 """Largest change of the setpoint in a step, in K, as that of environments by default."""
 
@@ -100,7 +100,7 @@ class BilledMonth:
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """What a plan starts from and has to leave, where it is not the state before the first step.
+    """States that a plan starts from and has to leave, if not the state before the first step.
 
     Without ``Ends`` a plan leaves at least the stored energy and at most the queue that there were
     at the first scored step.
@@ -125,7 +125,7 @@ class Problem:
     step_h: float
     """Length of a step, in h."""
     agents: tuple[Agent, ...]
-    """What the plan may move; the rest does what it does under idle commands."""
+    """Agents that the plan may move; the others follow idle commands."""
     table: FacilityTable
     """Energy, water and inlets of each step."""
     kwh_weight: F64
@@ -176,10 +176,10 @@ def problems_of(
         fleet: B data centers.
         drivers: Their inputs, with prices.
         sizing: Their devices.
-        tables: What their steps cost, B of T steps.
+        tables: Tables of their T steps, B.
         start: First step of each, counted from the beginning of the year, (B,).
-        objective: What a plan minimises.
-        agents: What a plan may move.
+        objective: Objective that plans minimise.
+        agents: Agents that plans may move.
         scored_from: First step that is scored.
         inlet_limit_c: Highest inlet that a plan may cause where it has a choice, in C; None is the
             limit of ``protection.ashrae_class``, and none where that is not set.
@@ -264,12 +264,10 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
     model = fleet.models["workload"]
     limits, due = queue_limit_tasks(fleet), due_steps(fleet)
     idle_tasks, dropped_tasks = _under_idle_commands(fleet, demand)
-    found = []
+    works = []
     for i, config in enumerate(fleet.configs):
-        share, cap = (
-            config.workload.flexible_share,
-            config.workload.max_utilisation * TASKS_PER_STEP,
-        )
+        share = config.workload.flexible_share
+        cap = config.workload.max_utilisation * TASKS_PER_STEP
         arrived = arrived_tasks(model, demand[i], share)
         deadline = None if np.isinf(due[i]) else int(due[i])
         if model == "tasks":
@@ -278,7 +276,7 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
         else:
             most_deferred = _most_deferred_fluid(arrived, share, cap, deadline)
             most_executed = np.full(len(arrived), cap)
-        found.append(
+        works.append(
             FlexibleWork(
                 arrived_tasks=arrived,
                 idle_tasks=idle_tasks[i],
@@ -290,7 +288,7 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
                 most_dropped_tasks=float(dropped_tasks[i, scored_from:].sum()),
             )
         )
-    return found
+    return works
 
 
 def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
@@ -384,7 +382,7 @@ def uncooled_reason(table: FacilityTable, utilisation: F64) -> str | None:
     """Why idle commands leave a table: steps in which no setpoint keeps up with the load.
 
     Args:
-        table: What steps cost.
+        table: Table of the steps.
         utilisation: Utilisation of each step, 0..1, (T,).
 
     Returns:
@@ -424,7 +422,7 @@ def forced_discharge_reason(problem: Problem) -> str | None:
 
 
 def _reasons(config: DataCenterConfig) -> list[str]:
-    """What the table of a data center leaves out."""
+    """Reasons why the table of a data center is not exact, in words."""
     events = config.events
     reasons = []
     if config.simulation.thermal == "transient":

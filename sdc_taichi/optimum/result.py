@@ -1,4 +1,4 @@
-"""What is known of the best that controllers can do with given data centers, inputs and steps."""
+"""Results: bound, achieved figure and path of data centers, and the value of states at the end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Optimum:
     objective: Objective
     """Objective that plans minimise."""
     agents: tuple[Agent, ...]
-    """What the plans may move."""
+    """Agents that the plans may move."""
     start: I64
     """First step of each data center, counted from the beginning of the year, (B,)."""
     seed: I64
@@ -56,11 +56,11 @@ class Optimum:
     alone: Mapping[str, F64]
     """Lowest figure reached with one agent alone, by its name, (B,) each."""
     bound_kinds: tuple[str, ...]
-    """What the bound of each data center is: ``bound``, or ``estimate`` or ``none``, and why."""
+    """Kind of the bound of each data center: ``bound``, or ``estimate`` or ``none``, and why."""
     failures: tuple[tuple[str, ...], ...]
     """Certificates of each data center that do not hold, in words."""
     certificates: tuple[Mapping[str, float], ...]
-    """What was measured when the simulator ran the plan of each data center, by name."""
+    """Measurements when the simulator ran the plan of each data center, by name."""
     load: F64
     """Load commands of the achieved path, (T, B)."""
     cooling: F64
@@ -111,8 +111,8 @@ class BoundOfEnds:
     """Bounds of data centers with given ends, computed when they are first asked for.
 
     Args:
-        task: What was solved.
-        kinds: What the bound of each data center is, B.
+        task: The data centers.
+        kinds: Kind of the bound of each, B.
         cache: Keeps them for later; None keeps none.
     """
 

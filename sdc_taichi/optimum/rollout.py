@@ -47,7 +47,7 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class RollOut:
-    """What the simulator did in T steps of B data centers."""
+    """Results of the simulator in T steps of B data centers."""
 
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (T, B)."""
@@ -104,16 +104,16 @@ def roll_out(
     Args:
         fleet: B data centers.
         drivers: Their inputs.
-        targets: What they are to do.
+        targets: States that they are to reach.
         start: First step of each, counted from the beginning of the year, (B,).
-        objective: What is minimised.
+        objective: Objective that the figure counts.
         scored_from: First step that is scored.
         seed: Of the sampled events, one for all or for each data center, (B,).
         precision: Of the hall kernels.
         on_step: Called after every step; an error that it raises ends the work.
 
     Returns:
-        What they did, and its score.
+        Results of all steps, and their score.
 
     Raises:
         PhysicalLimitError: A result that no data center can reach.
@@ -352,7 +352,7 @@ _LEAST_STORED_SHARE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What the simulator measured in the scored steps along a path of one data center."""
+    """Measurements of the simulator in the scored steps along a path of one data center."""
 
     figure: float
     """Figure of the scored steps, in the unit of the objective."""
@@ -380,7 +380,7 @@ class Certificate:
     """Cooling load that stays in the room, in kWh."""
 
     def failures(self, idle: Certificate, capacity_kwh: float) -> tuple[str, ...]:
-        """What the path breaks, in words; nothing where it may count as achieved.
+        """Constraints that the path breaks, in words; none where it counts as achieved.
 
         Args:
             idle: Certificate of idle commands.
@@ -406,11 +406,11 @@ class Certificate:
 
 
 def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certificate:
-    """What the simulator measured along one path, and how far that is from the table.
+    """Measurements of the simulator along one path, and their distance from the table.
 
     Args:
         problem: Planning problem of the data center.
-        done: What the simulator did, of this path alone.
+        done: Results of this path alone.
         score: Score of several paths.
         i: Number of the path in the score.
     """

@@ -100,8 +100,8 @@ def solve(
             the drivers.
         seed: Of the sampled events.
         drivers: Inputs; None reads what the configs name.
-        objective: What is minimised, or its text.
-        agents: What plans may move.
+        objective: Objective to minimise, or its text.
+        agents: Agents that plans may move.
         scored_from: First step that is scored; where it is not 0, plans end in the state that they
             have there.
         inlet_limit_c: Highest inlet that plans may cause where they have a choice, in C; None is
@@ -186,16 +186,16 @@ class _Run:
     """A path of one data center that the simulator has run."""
 
     path: Targets
-    """What it was to do."""
+    """States that it was to reach."""
     done: RollOut
-    """What it did."""
+    """Results of the simulator."""
     certificate: Certificate
-    """What was measured in the scored steps."""
+    """Measurements in the scored steps."""
 
 
 @dataclass(slots=True)
 class _Case:
-    """A data center and what is known of it so far."""
+    """A data center with its bound and the runs so far."""
 
     problem: Problem
     """Its planning problem."""
@@ -212,7 +212,7 @@ class _Case:
         return self.runs[JOINT if JOINT in self.runs else self.problem.agents[0]]
 
     def entry(self) -> Entry:
-        """What is known of the data center, from all its runs."""
+        """Bound, achieved figure and path of the data center, from all its runs."""
         certificates = {name: run.certificate for name, run in self.runs.items()}
         idle = certificates[IDLE]
         failures = {
@@ -250,7 +250,7 @@ class _Case:
 
 
 def _kind(reason: str | None, error: float) -> str:
-    """What a bound is, in words."""
+    """Kind of a bound, in words."""
     if reason is not None:
         return f"none: {reason}"
     if error > LARGEST_TABLE_ERROR:
@@ -292,10 +292,10 @@ class _Work:
         self._all = self._kept = self._missing = self._solved = self._size = 0
 
     def entries(self, task: Task, cache: Cache | None) -> list[Entry]:
-        """What is known of each data center, B.
+        """Bound, achieved figure and path of each data center, B.
 
         Args:
-            task: What is to be solved.
+            task: The data centers.
             cache: Where entries are kept; None keeps none.
 
         Raises:
@@ -401,7 +401,7 @@ class _Work:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _tell(self, stage: str, share: float, steps: int) -> None:
-        """Tell how much of a stage of the present part is done, in steps of data centers."""
+        """Report the share of a stage that the present part has done, in steps of data centers."""
         done = self._solved + share * self._size
         self._progress(stage, round(done * steps), self._missing * steps)
         self._go_on()
@@ -421,7 +421,7 @@ class _Work:
 
         Args:
             task: The data centers, B.
-            cases: What is known of them, B, to which the runs are added.
+            cases: The same, B, to which the runs are added.
             paths: Paths of each, of the same names, B.
         """
         names, size, steps = list(paths[0]), task.fleet.size, 0

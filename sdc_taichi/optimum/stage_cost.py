@@ -1,4 +1,4 @@
-"""What each step costs at least by the work that it does, and the convex curves below that.
+"""Least cost of each step by the work that it does, and the largest convex curves below it.
 
 The cost of a step with utilisation u is the least over permitted setpoints of the weighed energy
 of the facility and water. Three estimates lie between the nodes of a table:
@@ -78,7 +78,7 @@ def stage_cost(problem: Problem, *, warm_up_share: float = 0.0) -> StageCost:
     the agent of cooling the setpoint is that of idle commands.
 
     Args:
-        problem: What is to be planned.
+        problem: The planning problem.
         warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
 
     Raises:
@@ -101,7 +101,7 @@ def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64
     """Weights of a kWh bought and of a litre in each step, (T,) each.
 
     Args:
-        problem: What is to be planned.
+        problem: The planning problem.
         warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
     """
     weight, first = problem.kwh_weight.copy(), problem.scored_from
@@ -115,8 +115,8 @@ def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
     """The largest convex curves below cost and least energy, from the least to the most work.
 
     Args:
-        problem: What is to be planned.
-        stage: The least cost of its steps.
+        problem: The planning problem.
+        stage: Least cost of its steps.
     """
     least, most = work_limits(problem)
     most = np.maximum(np.minimum(most, stage.highest_tasks), least)
@@ -131,7 +131,7 @@ def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
         of_energy = _corners(x, kwh)
         cost, kwh = _below(x, cost, corner), _below(x, kwh, of_energy)
         corner |= of_energy
-    # The first and the last column are corners, or a single point twice.
+    # First and last column are hull vertices (identical if there is one point).
     step, column = np.nonzero(corner)
     same = step[1:] == step[:-1]
     at, last, after = step[1:][same], column[:-1][same], column[1:][same]
@@ -153,8 +153,8 @@ def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
     """Curves of a single point: the work that idle commands do.
 
     Args:
-        problem: What is to be planned.
-        stage: The least cost of its steps.
+        problem: The planning problem.
+        stage: Least cost of its steps.
     """
     tasks, none = problem.work.idle_tasks, np.zeros(0)
     return LoadCurves(
@@ -241,10 +241,10 @@ def _least(values: F64, permitted: Mask, edge: F64, setpoint_c: F64) -> tuple[F6
     best = np.where(permitted, values, np.inf)
     j = best.argmin(axis=2)[..., None]
     least = np.take_along_axis(best, j, axis=2)[..., 0]
-    found_c = setpoint_c[j[..., 0]]
+    best_c = setpoint_c[j[..., 0]]
     count = len(setpoint_c)
     if count < 2:
-        return least, found_c
+        return least, best_c
     spacing = setpoint_c[1] - setpoint_c[0]
     if count > 2:
         middle = np.clip(j, 1, count - 2)
@@ -259,21 +259,21 @@ def _least(values: F64, permitted: Mask, edge: F64, setpoint_c: F64) -> tuple[F6
         lowest = y[1] + slope * at + 0.5 * bend * at**2
         lower = bent & (lowest < least)
         least = np.where(lower, lowest, least)
-        found_c = np.where(lower, setpoint_c[middle[..., 0]] + at * spacing, found_c)
+        best_c = np.where(lower, setpoint_c[middle[..., 0]] + at * spacing, best_c)
     for k in np.flatnonzero(np.isfinite(edge).any(axis=(0, 1))):
         share = edge[..., k]
         there = values[..., k] + share * (values[..., k + 1] - values[..., k])
         lower = there < least
         least = np.where(lower, there, least)
-        found_c = np.where(lower, setpoint_c[k] + share * spacing, found_c)
-    return least, found_c
+        best_c = np.where(lower, setpoint_c[k] + share * spacing, best_c)
+    return least, best_c
 
 
 def _extend(problem: Problem, tasks: F64, t: int, rows: tuple[F64, ...]) -> float:
     """Continue the values of a step beyond what can be cooled, in place.
 
-    What can be cooled ends between two nodes, so the curve goes on to the second in a straight
-    line: a plan may not do that, but no controller can do better.
+    The most work that can be cooled lies between two nodes, so the curve continues to the second in
+    a straight line: a plan may not do that, but no controller can do better.
 
     Returns:
         The highest amount of work that is permitted, in tasks.
@@ -357,7 +357,7 @@ def _corners(x: F64, y: F64) -> Mask:
 
 def _below(x: F64, y: F64, corner: Mask) -> F64:
     """Values of the convex curves through corners at all places, (T, N)."""
-    found = np.empty(y.shape)
+    below = np.empty(y.shape)
     for t in range(len(y)):
-        found[t] = np.interp(x[t], x[t, corner[t]], y[t, corner[t]])
-    return found
+        below[t] = np.interp(x[t], x[t, corner[t]], y[t, corner[t]])
+    return below

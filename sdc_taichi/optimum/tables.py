@@ -1,4 +1,4 @@
-"""Tables of what a step costs by utilisation and setpoint, from batches of the simulator itself."""
+"""Tables of energy, water and inlets by utilisation and setpoint, made by the simulator itself."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sdc_taichi.types import F64, I64
 
 @dataclass(frozen=True, slots=True)
 class FacilityTable:
-    """What a step costs by utilisation and setpoint: T steps, I utilisations, J setpoints.
+    """Results of a step by utilisation and setpoint: T steps, I utilisations, J setpoints.
 
     Values are those of the simulator at constant utilisation and setpoint in the weather of each
     step. Between utilisations they are read linearly.
@@ -230,7 +230,7 @@ def batches(fleet: Fleet, nodes: Sequence[Nodes]) -> Iterator[list[Nodes]]:
 
 
 def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
-    """What the energy of a facility follows from beside weather, load and setpoint.
+    """Values that decide the energy of a facility, besides weather, load and setpoint.
 
     Args:
         fleet: B data centers.
@@ -254,7 +254,7 @@ def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
 
 
 def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashable:
-    """What a table follows from beside its number of steps: facility, weather and first step."""
+    """Values that decide a table besides its number of steps: facility, weather, first step."""
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
@@ -303,7 +303,7 @@ def _error_midway(utilisation: F64, kwh: F64, spacing: int) -> float:
     Args:
         utilisation: Utilisations, (I,).
         kwh: Energy, (T, I, J).
-        spacing: Every so many utilisations there is a node, an even number.
+        spacing: Number of utilisations from one node to the next, even.
     """
     node = kwh[:, ::spacing]
     midway = (9.0 * (node[:, 1:-2] + node[:, 2:-1]) - node[:, :-3] - node[:, 3:]) / 16.0
@@ -418,12 +418,12 @@ def cubic(nodes: F64, values: F64, at: F64) -> F64:
     first = np.clip(np.searchsorted(nodes, at) - points // 2, 0, len(nodes) - points)
     x = nodes[first[:, None] + np.arange(points)]
     y = np.take_along_axis(values, first[:, None] + np.arange(points), axis=1)
-    found = np.zeros(len(at))
+    total = np.zeros(len(at))
     for k in range(points):
         others = np.delete(x, k, axis=1)
         share = (at[:, None] - others) / (x[:, k : k + 1] - others)
-        found += y[:, k] * share.prod(axis=1)
-    return found
+        total += y[:, k] * share.prod(axis=1)
+    return total
 
 
 def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
@@ -448,7 +448,7 @@ def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64
     """Energy of the facility in each step, in kWh, (T,).
 
     Args:
-        table: What steps cost.
+        table: Table of the steps.
         utilisation: Utilisation of each step, (T,).
         setpoint_c: Setpoint of each step, in C, (T,).
     """

@@ -1,4 +1,4 @@
-"""What is to be solved: data centers with inputs and options, and parts of them."""
+"""The task of finding optima: data centers with inputs and options, and parts of them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ INLET_LIMITS_C = -50.0, 100.0
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is to be solved: B data centers with inputs and options."""
+    """Task of finding the optima of B data centers with inputs and options."""
 
     fleet: Fleet
     """The data centers, B."""
@@ -45,7 +45,7 @@ class Task:
     objective: Objective
     """Objective that plans minimise."""
     agents: tuple[Agent, ...]
-    """What plans may move."""
+    """Agents that plans may move."""
     scored_from: int
     """First step that is scored."""
     inlet_limit_c: float | None
