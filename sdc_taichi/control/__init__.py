@@ -1,6 +1,6 @@
-"""Controllers, by name and by rules, and what a controller sees.
+"""Controllers by name and by rules, and the views that they decide on.
 
-A controller turns a view of the data centers into actions, and knows them by nothing else.
+A controller turns a view of the data centers into actions and has no other access to them.
 Learning algorithms and physics never live here.
 """
 

@@ -109,7 +109,7 @@ class ModelPredictive:
         self.reset(0)
 
     def reset(self, seed: int | I64) -> None:
-        """Forget the episode before."""
+        """Begin an episode that does not depend on earlier ones."""
         self._bill: BilledDemand | None = None
         self._view: View | None = None
         self._actions = Actions()

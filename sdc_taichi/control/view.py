@@ -1,4 +1,4 @@
-"""How forecasts err: standard deviations, and the random walks that errors are made of.
+"""Views of data centers for controllers, and forecasts with errors made of random walks.
 
 The error of the forecast that is issued at time t for t + h is ``s (W(t + h) - W(t))`` with a
 standard deviation s at 24 h and a random walk W of unit variance per 24 h. It is zero for the
@@ -41,7 +41,7 @@ _DRAWN_STEPS = 128
 
 @dataclass(frozen=True, slots=True)
 class ForecastError:
-    """How forecasts err: standard deviations at a lead of 24 h. Zero is perfect foresight.
+    """Errors of forecasts: standard deviations at a lead of 24 h. Zero is perfect foresight.
 
     Raises:
         ConfigError: a value that is no number or out of bounds.
@@ -147,11 +147,11 @@ class RandomWalks:
 
 
 def walk_keys(seeds: I64, names: Sequence[str]) -> I64:
-    """Seeds of the walks of a run, (B,), apart from those of its events and controllers.
+    """Seeds of the walks of a run, (B,), other than those of its events and controllers.
 
     Args:
         seeds: seed of each data center, (B,).
-        names: names of the data centers, so that those of one seed err apart, B of them.
+        names: names of the data centers, B, so that data centers of one seed have other errors.
     """
     drawn = [
         np.random.SeedSequence([int(seed), zlib.crc32(name.encode())]).generate_state(1, np.uint64)
@@ -309,7 +309,7 @@ def limits_of(fleet: Fleet) -> Limits:
 def view_maker(
     sim: Simulator, forecast_error: ForecastError = PERFECT, keys: I64 | None = None
 ) -> Callable[[StepResult | None], View]:
-    """A function that makes the view before each step of an episode.
+    """Function that makes the view before each step of an episode.
 
     Args:
         sim: a simulator that has been reset.

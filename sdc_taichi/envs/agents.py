@@ -1,4 +1,4 @@
-"""The three agents of a data center: what each commands, observes and is paid for by default."""
+"""The three agents of a data center: their commands, and default features and reward scales."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Observer:
 
     Args:
         fleet: the data centers.
-        agents: agents whose observations are wanted.
+        agents: agents that observe.
         features: names of the features of each agent; None is the default ones.
         ci_leads_h: leads of the carbon-intensity forecast in h, rising multiples of the step.
         weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
@@ -241,7 +241,7 @@ def make_observer(
 
     Args:
         fleet: the data centers.
-        options: what agents see.
+        options: observations and leads.
         new_inputs: whether episodes may have other inputs than those before.
 
     Raises:

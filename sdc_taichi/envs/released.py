@@ -54,22 +54,22 @@ _AGE_LIMIT_DAYS = 400.0
 
 
 def _scaled(name: str, description: str) -> Feature:
-    """An input over its range."""
+    """Entry that is an input less its minimum, divided by its range."""
     return Feature(name, "scaled", -_SCALED_LIMIT, _SCALED_LIMIT, description)
 
 
 def _slope(name: str, description: str) -> Feature:
-    """A trend of a scaled input."""
+    """Entry that is a trend of a scaled input."""
     return Feature(name, "scaled/step", -_SCALED_LIMIT, _SCALED_LIMIT, description)
 
 
 def _share(name: str, description: str, unit: str = "-") -> Feature:
-    """A value of 0..1."""
+    """Entry of 0..1."""
     return Feature(name, unit, 0.0, 1.0, description)
 
 
 def _age(name: str, description: str) -> Feature:
-    """An age of queued tasks."""
+    """Entry that is an age of queued tasks."""
     return Feature(name, "d", 0.0, _AGE_LIMIT_DAYS, description)
 
 
@@ -412,7 +412,7 @@ def footprint_reward(norm_ci: F64, grid_kwh: F64, low_kwh: F64, high_kwh: F64) -
     """Reward of the battery agent, and the energy part of the load agent's (paper, F.2), (B,).
 
     Args:
-        norm_ci: carbon intensity over its range, 0..1, (B,).
+        norm_ci: carbon intensity as a share of its range, 0..1, (B,).
         grid_kwh: energy of the step with the battery, in kWh, (B,).
         low_kwh: least energy of a step, in kWh, (B,).
         high_kwh: greatest energy of a step, in kWh, (B,).
@@ -436,7 +436,10 @@ def load_penalty(dropped_tasks: F64, queue_tasks: F64, day_share: F64) -> F64:
 
 
 def cooling_reward(facility_kw: F64, low_kw: F64, high_kw: F64) -> F64:
-    """Reward of the cooling agent, IT and HVAC power over its range (``reward_creator.py``), (B,).
+    """Reward of the cooling agent: IT and HVAC power as a share of its range, (B,).
+
+    Source: ``reward_creator.py``.
+
 
     Args:
         facility_kw: IT and HVAC power of the step, in kW, (B,).

@@ -173,7 +173,7 @@ class TimeRows:
 
 
 class Forecasts:
-    """Carbon intensity, weather and prices of a fleet at present and at each lead.
+    """Carbon intensity, weather, prices and work of a fleet at present and at each lead.
 
     Args:
         steps_per_hour: number of steps in an hour.
