@@ -342,7 +342,7 @@ def _share(part: F64, whole: F64) -> F64:
 
 LARGEST_TABLE_ERROR = 1e-4
 """Largest error of a table, as a share of the energy, with which a bound still is one."""
-LEAST_TASKS = 1e-6
+_LEAST_TASKS = 1e-6
 """Work that rounding may leave, in tasks."""
 LEAST_K = 1e-3
 """Temperature by which the precision of the kernels may exceed a limit, in K."""
@@ -388,21 +388,44 @@ class Certificate:
         """
         missing_kwh = self.start_kwh - self.end_kwh
         more_tasks = self.end_tasks - self.start_tasks
-        dropped = self.dropped_tasks - idle.dropped_tasks
         texts = []
         if missing_kwh > _LEAST_STORED_SHARE * capacity_kwh:
             texts.append(f"ends with {missing_kwh:.4g} kWh less in the battery")
-        if more_tasks > LEAST_TASKS:
+        if more_tasks > _LEAST_TASKS:
             texts.append(f"ends with {more_tasks:.4g} tasks more in the queue")
-        if dropped > LEAST_TASKS:
-            texts.append(f"drops {dropped:.4g} tasks more than idle commands")
-        if self.overdue_tasks > idle.overdue_tasks + LEAST_TASKS:
-            texts.append(f"leaves up to {self.overdue_tasks:.4g} tasks overdue")
+        hot = ""
         if self.over_limit_k > LEAST_K:
-            texts.append(f"has inlets up to {self.over_limit_k:.3g} K over the limit")
-        if self.unmet_kwh > idle.unmet_kwh * (1.0 + 1e-6) + 1e-6:
-            texts.append(f"leaves {self.unmet_kwh - idle.unmet_kwh:.4g} kWh of heat in the room")
+            hot = f"has inlets up to {self.over_limit_k:.3g} K over the limit"
+        texts += broken_constraints(
+            self.dropped_tasks - idle.dropped_tasks,
+            (self.overdue_tasks, idle.overdue_tasks),
+            hot,
+            (self.unmet_kwh, idle.unmet_kwh),
+        )
         return tuple(texts)
+
+
+def broken_constraints(
+    dropped_more: float, overdue: tuple[float, float], hot: str, unmet_kwh: tuple[float, float]
+) -> list[str]:
+    """Constraints that a run breaks although another run keeps them, in words.
+
+    Args:
+        dropped_more: Work that is dropped beyond that of idle commands, in tasks.
+        overdue: Most overdue work of the run and of the other, in tasks.
+        hot: Text about inlets over their limit; empty where they keep it.
+        unmet_kwh: Heat that stays in the room in the run and in the other, in kWh.
+    """
+    texts = []
+    if dropped_more > _LEAST_TASKS:
+        texts.append(f"drops {dropped_more:.4g} tasks more than idle commands")
+    if overdue[0] > overdue[1] + _LEAST_TASKS:
+        texts.append(f"leaves up to {overdue[0]:.4g} tasks overdue")
+    if hot:
+        texts.append(hot)
+    if unmet_kwh[0] > unmet_kwh[1] * (1.0 + 1e-6) + 1e-6:
+        texts.append(f"leaves {unmet_kwh[0]:.4g} kWh of heat in the room")
+    return texts
 
 
 def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certificate:

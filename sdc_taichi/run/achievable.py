@@ -17,7 +17,7 @@ from sdc_taichi.control import PERFECT, Controller, ForecastError, View
 from sdc_taichi.errors import SdcError
 from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.rollout import LEAST_K, LEAST_TASKS
+from sdc_taichi.optimum.rollout import LEAST_K, broken_constraints
 from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import finite_or_none
@@ -209,17 +209,13 @@ def _broken(optimum: Optimum, score: Score, dc: int) -> list[str]:
 
     Where no setpoint keeps a limit, the achieved path does not either.
     """
-    best, texts = optimum.certificates[dc], []
-    dropped = score.dropped_tasks[dc] - optimum.idle_dropped_tasks[dc]
-    if dropped > LEAST_TASKS:
-        texts.append(f"drops {dropped:.4g} tasks more than idle commands")
-    overdue = score.most_overdue_tasks[dc]
-    if overdue > best["overdue_tasks"] + LEAST_TASKS:
-        texts.append(f"leaves up to {overdue:.4g} tasks overdue")
+    best, hot = optimum.certificates[dc], ""
     limit_c, hottest_c = optimum.inlet_limit_c[dc], score.hottest_inlet_c[dc]
     if hottest_c > max(limit_c, best["hottest_inlet_c"]) + LEAST_K:
-        texts.append(f"has an inlet of {hottest_c:.2f} C, over the limit of {limit_c:g} C")
-    unmet_kwh = score.unmet_kwh[dc]
-    if unmet_kwh > best["unmet_kwh"] * (1.0 + 1e-6) + 1e-6:
-        texts.append(f"leaves {unmet_kwh:.4g} kWh of heat in the room")
-    return texts
+        hot = f"has an inlet of {hottest_c:.2f} C, over the limit of {limit_c:g} C"
+    return broken_constraints(
+        score.dropped_tasks[dc] - optimum.idle_dropped_tasks[dc],
+        (score.most_overdue_tasks[dc], best["overdue_tasks"]),
+        hot,
+        (score.unmet_kwh[dc], best["unmet_kwh"]),
+    )
