@@ -39,9 +39,10 @@ class ClaimedFileError(SdcError):
 class FileClaim:
     """The right to write a file, which one process has at a time.
 
-    It is a hidden file beside the one to be written, ``.NAME.part``, that is open and locked. The
-    system frees the lock when the process ends, however it ends; whoever writes next takes over
-    what is left. On a file system without locks nobody is kept out, and the last one to end wins.
+    The claim is a hidden file, ``.NAME.part``, beside the file to be written, which is open and
+    locked. The system frees the lock when the process ends, for any reason; the next writer takes
+    over the hidden file. On a file system without locks several processes can write at a time, and
+    the last one to end determines the content.
 
     Args:
         path: the file that is to be written.
@@ -150,7 +151,7 @@ class _NoLocksError(Exception):
 
 
 def _open_alone(part: Path) -> IO[bytes] | None:
-    """Open the hidden file of a claim, and empty it; None while it is another's.
+    """Open the hidden file of a claim, and empty it; None while another claim holds it.
 
     Raises:
         OSError: it cannot be opened.

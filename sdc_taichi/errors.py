@@ -1,6 +1,6 @@
 """Errors a user can cause; every message names the place, the value and what would be valid.
 
-What the user should know although work goes on is an ``SdcWarning``.
+What a user should know while the work continues is an ``SdcWarning``.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def one_line(text: str) -> str:
     """Text of a message on one line of bounded length that is safe to print."""
     line = printable(" ".join(text.split()))
     if len(line) > MOST_CHARACTERS:
-        kept = MOST_CHARACTERS // 2
-        line = f"{line[:kept]} ... {line[-kept:]}"
+        half = MOST_CHARACTERS // 2
+        line = f"{line[:half]} ... {line[-half:]}"
     return line
 
 
@@ -43,8 +43,8 @@ class SdcError(ValueError):
     """Base of all errors caused by input; the command line prints them without a traceback.
 
     Args:
-        message: what was found where, and what would be valid; kept as ``one_line`` makes it. Or
-            an error, whose text is taken: Gymnasium rebuilds errors of worker processes so.
+        message: place, value, and what would be valid, which ``one_line`` shortens; or an error,
+            from which Gymnasium rebuilds errors of worker processes.
     """
 
     def __init__(self, message: object) -> None:
@@ -120,7 +120,7 @@ def similar_names(name: object, valid: Iterable[str], most: int = 1) -> list[str
 
 
 def suggestion(name: object, valid: Iterable[str], text: str = "; did you mean {!r}?") -> str:
-    """End of a message about an unknown name: what was probably meant.
+    """End of a message about an unknown name: the most similar valid name.
 
     Args:
         name: what was given.
@@ -135,6 +135,6 @@ def suggestion(name: object, valid: Iterable[str], text: str = "; did you mean {
 
 
 def suggestion_or_valid(name: object, valid: Iterable[str]) -> str:
-    """End of a message about an unknown name: what was probably meant, or else all valid names."""
+    """End of a message about an unknown name: the most similar valid name, or all valid names."""
     names = list(valid)
     return suggestion(name, names) or f"; valid: {', '.join(names)}"

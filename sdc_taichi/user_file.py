@@ -1,7 +1,7 @@
-"""Files that users name: kind and size are checked first, and what fails is one error.
+"""Files that users name: their kind and size are checked first, and every failure is one error.
 
-``open_input`` opens a regular file of a limited size, ``decoding`` stands around the library that
-reads its content, and ``ArrayFile`` tells the shapes of arrays before it reads them.
+``open_input`` opens a regular file of a limited size, ``decoding`` converts the errors of the
+library that reads its content, and ``ArrayFile`` gives the shapes of arrays before it reads them.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ def open_input(
             status = os.stat(path)
         except ValueError as failed:
             raise error(f"{str(path)!r}: is no name of a file ({failed})") from failed
-        found = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), None)
-        if found is not None:
-            raise error(f"{path}: is {found}; valid is a file")
+        kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), None)
+        if kind is not None:
+            raise error(f"{path}: is {kind}; valid is a file")
         if status.st_size > most_bytes:
             raise error(
                 f"{path}: has {status.st_size / 1e6:,.1f} MB; valid is at most "

@@ -22,8 +22,8 @@ def register_function(
 ) -> None:
     """Make a function available by a name.
 
-    A function of the same module and name as the one before takes its place: it is the same cell of
-    a notebook, run again.
+    A function replaces an earlier one of the same module and name, as when a cell of a notebook is
+    run again.
 
     Args:
         kind: what the function is, for errors.
@@ -45,35 +45,35 @@ def register_function(
     registered[name] = function
 
 
-def function_named(option: str, given: Any, registered: dict[str, Any], *, valid: str) -> Any:
+def function_named(option: str, value: Any, registered: dict[str, Any], *, valid: str) -> Any:
     """A registered function, or one by its import path ``module:name``.
 
     Args:
         option: name of the option, for errors.
-        given: what the option was given.
+        value: value of the option.
         registered: functions by name.
         valid: what the option takes besides functions and their import paths, for errors.
 
     Raises:
         ConfigError: an unknown name, or a path without a function.
     """
-    module, _, name = given.partition(":") if isinstance(given, str) else ("", "", "")
-    if isinstance(given, str) and given in registered:
-        return registered[given]
+    module, _, name = value.partition(":") if isinstance(value, str) else ("", "", "")
+    if isinstance(value, str) and value in registered:
+        return registered[value]
     if not module or not name or module.startswith("."):
         raise ConfigError(
-            f"{option} {shortened(given)}: unknown; valid: {valid}, a function, or its import path "
+            f"{option} {shortened(value)}: unknown; valid: {valid}, a function, or its import path "
             "module:name"
         )
     try:
-        found = getattr(importlib.import_module(module), name)
+        function = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{option} {shortened(given)}: cannot be imported ({error})") from None
-    if not callable(found):
+        raise ConfigError(f"{option} {shortened(value)}: cannot be imported ({error})") from None
+    if not callable(function):
         raise ConfigError(
-            f"{option} {shortened(given)}: is a {type(found).__name__}; valid is a function"
+            f"{option} {shortened(value)}: is a {type(function).__name__}; valid is a function"
         )
-    return found
+    return function
 
 
 def import_path(function: Callable[..., Any]) -> str:
@@ -88,7 +88,7 @@ def checked_values(what: str, returned: Any, whose: str, size: int) -> F64:
     Args:
         what: what the function is, for errors.
         returned: what it returned.
-        whose: for whom it returned that, for errors.
+        whose: for which data centers it returned them, for errors.
         size: number of data centers, B.
 
     Raises:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from datetime import date, datetime, timedelta
+from datetime import datetime, timedelta
 from functools import cache
 from http.server import BaseHTTPRequestHandler
-from typing import Any, cast
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
 from faulty_server import Answer, sends
-from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH
 
 MEGAWATTS = {"COL": 500.0, "NG": 3000.0, "NUC": 2000.0, "SUN": 0.0, "WND": 800.0}
 """Generation of each hour in MWh, besides the sun."""
@@ -32,56 +31,25 @@ def by_query(make: Callable[[dict[str, str]], bytes], kind: str = "application/j
 
 
 @cache
-def _pvgis_text(latitude: float, longitude: float) -> str:
-    return json.dumps(_pvgis_year(latitude, longitude))
+def _pvgis_rows() -> str:
+    hours = np.datetime64("2001-01-01T00", "h") + np.arange(8760)
+    rows = []
+    for at, hour in enumerate(hours.tolist()):
+        # A typical year has months of different years.
+        stamp = f"{2004 + hour.month}{hour:%m%d:%H}00"
+        pressure = 99870.0 + 50.0 * (hour.day % 7)
+        rows.append(
+            {"time(UTC)": stamp, "T2m": at / 1000.0, "RH": 60.0, "G(h)": 9.0, "SP": pressure}
+        )
+    return json.dumps(rows)
 
 
 def pvgis_year(latitude: float = 45.0, longitude: float = 8.0) -> dict[str, Any]:
     """A typical year of months of twelve years, whose dry bulb is the hour of the year / 1000."""
-    return cast(dict[str, Any], json.loads(_pvgis_text(latitude, longitude)))
-
-
-def _pvgis_year(latitude: float, longitude: float) -> dict[str, Any]:
-    rows: list[dict[str, Any]] = []
-    for month, days in enumerate(DAYS_PER_MONTH, 1):
-        for day in range(1, days + 1):
-            for hour in range(24):
-                rows.append(
-                    {
-                        "time(UTC)": f"{2004 + month}{month:02d}{day:02d}:{hour:02d}00",
-                        "T2m": round(len(rows) / 1000.0, 3),
-                        "RH": 60.0,
-                        "G(h)": 120.0,
-                        "Gb(n)": 80.5,
-                        "Gd(h)": 40.0,
-                        "IR(h)": 283.58,
-                        "WS10m": 1.5,
-                        "WD10m": 350.0 if hour % 2 else 10.0,
-                        "SP": 99870.0 + 50.0 * (day % 7),
-                    }
-                )
+    location = {"latitude": latitude, "longitude": longitude, "elevation": 250.0}
     return {
-        "inputs": {
-            "location": {
-                "latitude": latitude,
-                "longitude": longitude,
-                "elevation": 250.0,
-                "irradiance_time_offset": 0.1761,
-            },
-            "meteo_data": {
-                "radiation_db": "PVGIS-SARAH3",
-                "meteo_db": "ERA5",
-                "year_min": 2005,
-                "year_max": 2023,
-                "use_horizon": True,
-                "horizon_db": "DEM-calculated",
-            },
-        },
-        "outputs": {
-            "months_selected": [{"month": m, "year": 2004 + m} for m in range(1, 13)],
-            "tmy_hourly": rows,
-        },
-        "meta": {"inputs": {}, "outputs": {}},
+        "inputs": {"location": location, "meteo_data": {"meteo_db": "ERA5"}},
+        "outputs": {"tmy_hourly": json.loads(_pvgis_rows())},
     }
 
 
@@ -102,9 +70,7 @@ def eia_rows(start: datetime, stop: datetime, utc_offset_h: float = -8.0) -> lis
                 {
                     "period": f"{start:%Y-%m-%dT%H}",
                     "respondent": "CISO",
-                    "respondent-name": "California Independent System Operator",
                     "fueltype": source,
-                    "type-name": source.title(),
                     "value": f"{value:g}",
                     "value-units": "megawatthours",
                 }
@@ -115,15 +81,8 @@ def eia_rows(start: datetime, stop: datetime, utc_offset_h: float = -8.0) -> lis
 
 def eia_document(rows: list[dict[str, Any]], query: dict[str, str]) -> bytes:
     """An answer of version 2 of the service, which repeats what was asked, the key included."""
-    response = {
-        "total": str(len(rows)),
-        "dateFormat": 'YYYY-MM-DD"T"HH24',
-        "frequency": "hourly",
-        "data": rows,
-        "description": "Hourly net generation by balancing authority and energy source.",
-    }
-    request = {"command": "/v2/electricity/rto/fuel-type-data/data/", "params": query}
-    return json.dumps({"response": response, "request": request, "apiVersion": "2.1.8"}).encode()
+    response = {"total": str(len(rows)), "data": rows}
+    return json.dumps({"response": response, "request": {"params": query}}).encode()
 
 
 @cache
@@ -218,18 +177,7 @@ def electricity_maps_table(
     year: int = 2023, column: str = "Carbon intensity gCO₂eq/kWh (Life cycle)"
 ) -> bytes:
     """A yearly table: the intensity is the hour of the day in UTC plus 100."""
-    header = [
-        *("Datetime (UTC)", "Country", "Zone name", "Zone id"),
-        *("Carbon intensity gCO₂eq/kWh (direct)", column),
-        *("Carbon-free energy percentage (CFE%)", "Renewable energy percentage (RE%)"),
-        *("Data source", "Data estimated", "Data estimation method"),
-    ]
-    lines = [",".join(header)]
-    day = date(year, 1, 1)
-    while day.year == year:
-        lines += [
-            f"{day} {h:02d}:00:00,France,France,FR,20.0,{100 + h}.25,95,25,entsoe.eu,false,"
-            for h in range(24)
-        ]
-        day += timedelta(days=1)
+    lines = [f"Datetime (UTC),Zone id,Carbon intensity gCO₂eq/kWh (direct),{column},Data source"]
+    hours = np.arange(np.datetime64(f"{year}-01-01T00"), np.datetime64(f"{year + 1}-01-01T00"))
+    lines += [f"{at:%Y-%m-%d %H}:00:00,FR,20.0,{100 + at.hour}.25,x" for at in hours.tolist()]
     return ("\n".join(lines) + "\n").encode()

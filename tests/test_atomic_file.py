@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -89,29 +88,6 @@ def test_what_a_killed_process_left_is_taken_over(tmp_path: Path) -> None:
         file.write(b"new")
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == ["a.txt"]
-
-
-@pytest.mark.skipif(os.name == "nt", reason="files that are open cannot be renamed on Windows")
-@pytest.mark.parametrize("end", ["renamed", "deleted"])
-def test_a_claim_that_ends_while_another_opens_the_file_is_noticed(
-    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = FileClaim(tmp_path / "a")
-    open_file = os.open
-
-    def open_late(*arguments: Any) -> int:
-        opened = open_file(*arguments)
-        monkeypatch.undo()
-        first.rename() if end == "renamed" else first.release()
-        return opened
-
-    monkeypatch.setattr(os, "open", open_late)
-    second = FileClaim(tmp_path / "a")
-    assert os.fstat(second.file.fileno()).st_ino == (tmp_path / ".a.part").stat().st_ino
-    with pytest.raises(SdcError, match="another run"):
-        FileClaim(tmp_path / "a")
-    second.release()
-    assert names(tmp_path) == (["a"] if end == "renamed" else [])
 
 
 def test_a_claim_that_is_forgotten_leaves_nothing(tmp_path: Path) -> None:

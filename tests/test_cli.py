@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,6 @@ from sdc_taichi.control import View, make_controller
 from sdc_taichi.run import loop
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_writer import simulate_to_folder
-from sdc_taichi.run.metrics import add_step, empty_totals
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 HEAVY = {"taichi", "pandas", "pyarrow", "psychrolib", "matplotlib", "rerun"}
@@ -173,18 +171,6 @@ def test_hottest_rack_is_found_in_its_data_center() -> None:
     assert totals.hottest_rack.tolist() == [0, 1, 2, 3]
 
 
-def test_the_first_of_equal_inlets_is_the_hottest_and_one_at_the_limit_is_not_above() -> None:
-    totals = empty_totals(1, 0.25)
-    with Simulator(load_config("tiny")) as sim:
-        sim.reset()
-        result = sim.step()
-    for step in range(3):
-        inlet_c = np.array([27.0 + step * 4e-15])
-        add_step(totals, replace(result, inlet_max_c=inlet_c, step=step))
-    assert totals.hottest_step.tolist() == [0]
-    assert totals.hot_steps.tolist() == [0]
-
-
 def test_steps_hold_every_quantity_of_every_step(two_sites: Path) -> None:
     steps = steps_of(two_sites)
     with Simulator(load_config("tiny")) as sim:
@@ -260,13 +246,6 @@ def test_the_same_command_again_replaces_its_run(tmp_path: Path) -> None:
     assert load_config(out / "config.yaml").site.location == "NY"
 
 
-def test_what_a_broken_off_run_left_may_be_replaced(tmp_path: Path) -> None:
-    for name in ("steps.parquet", "report.html", "hall.rrd"):
-        (tmp_path / name).write_text("left")
-    simulate(tmp_path, "--days", 0.25)
-    assert len(steps_of(tmp_path)) == 24
-
-
 def test_default_folder_names_preset_sites_and_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,13 +264,6 @@ def test_overrides_by_option_and_bare(tmp_path: Path) -> None:
     read = load_config(tmp_path / "run" / "config.yaml")
     assert (read.hvac.setpoint.initial_c, read.hvac.setpoint.step_k) == (20.0, 0.5)
     assert set(steps_of(tmp_path / "run")["setpoint_c"]) == {20.0}
-
-
-def test_steps_per_hour_set_the_number_of_steps(tmp_path: Path) -> None:
-    report = simulate(tmp_path / "run", "--days", 0.5, "simulation.steps_per_hour=12")
-    assert report["steps_done"] == 144
-    times = steps_of(tmp_path / "run")["time"]
-    assert set(times.diff().dropna()) == {pd.Timedelta(minutes=5)}
 
 
 def test_sampling_varies_the_data_centers_and_repeats(tmp_path: Path) -> None:
@@ -319,23 +291,6 @@ def test_the_year_turns_after_31_december(tmp_path: Path) -> None:
         "2001-12-31 00:00:00",
         "2002-01-01 00:00:00",
     )
-
-
-def test_a_run_longer_than_a_year_repeats_the_inputs(tmp_path: Path) -> None:
-    simulate(tmp_path / "run", "--days", 366, "simulation.steps_per_hour=1")
-    steps = steps_of(tmp_path / "run")
-    assert len(steps) == 366 * 24
-    first, second = steps["outdoor_c"].iloc[:24], steps["outdoor_c"].iloc[8760:]
-    assert first.tolist() == second.tolist()
-
-
-def test_rows_are_written_in_groups_of_bounded_size(tmp_path: Path) -> None:
-    simulate(tmp_path / "run", "--dcs", 900)
-    file = pq.ParquetFile(tmp_path / "run" / "steps.parquet")
-    sizes = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-    assert sum(sizes) == 900 * 96
-    assert len(sizes) > 1
-    assert max(sizes) <= 1 << 16
 
 
 # Inputs from files
@@ -465,35 +420,10 @@ def test_summary_for_many_data_centers_is_a_spread(tmp_path: Path) -> None:
     assert "ny-01" not in done.stdout
 
 
-def test_quiet_prints_nothing(tmp_path: Path) -> None:
-    done = call("simulate", "tiny", "--days", 0.25, "--quiet", "--out", tmp_path / "run")
-    assert (done.exit_code, done.output) == (0, "")
-    assert names_in(tmp_path / "run") == FILES | {"config.yaml"}
-
-
-def test_json_is_the_metrics_file(tmp_path: Path) -> None:
-    report = simulate(tmp_path / "run")
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text()) == report
-
-
 def test_piped_output_holds_nothing_but_the_answer(tmp_path: Path) -> None:
     done = program("simulate", "tiny", "--days", 0.25, "--json", "--out", tmp_path / "run")
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["steps_done"] == 24
-
-
-def test_progress_is_for_terminals(tmp_path: Path) -> None:
-    pty = pytest.importorskip("pty", reason="pseudo-terminals are for POSIX")
-    shown, terminal = pty.openpty()
-    done = subprocess.run(
-        [*PROGRAM, "simulate", "tiny", "--days", "1", "--out", str(tmp_path / "run")],
-        stdout=subprocess.PIPE, stderr=terminal, env=os.environ | {"TERM": "xterm"}, timeout=120,
-    )  # fmt: skip
-    os.close(terminal)
-    assert done.returncode == 0
-    assert b"simulating" in os.read(shown, 65536)
-    assert b"simulating" not in done.stdout
-    os.close(shown)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["--version"]])
@@ -509,10 +439,6 @@ def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
     assert status == "0"
     assert HEAVY.isdisjoint(name.partition(".")[0] for name in modules)
     assert "sdc-taichi" in done.stdout
-
-
-def test_version() -> None:
-    assert call("--version").stdout == f"sdc-taichi {sdc_taichi.__version__}\n"
 
 
 # Interruption and failure
@@ -551,16 +477,6 @@ def wait_for(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < limit, "nothing was written within a minute"
         time.sleep(0.02)
-
-
-def test_stopped_before_the_first_step_writes_nothing(tmp_path: Path) -> None:
-    with Simulator(load_config("tiny")) as sim:
-        controller = make_controller("idle", sim.fleet)
-        report = simulate_to_folder(
-            sim, controller, RunRequest("idle", 5), tmp_path / "run", stop=lambda: True
-        )
-    assert report is None
-    assert names_in(tmp_path / "run") == set()
 
 
 def test_each_data_center_lists_the_events_that_it_met(tmp_path: Path) -> None:
@@ -695,12 +611,6 @@ def test_shown_config_reads_back_equal(tmp_path: Path, name: str) -> None:
     assert call("config", "show", path).stdout == shown
 
 
-def test_config_list_names_every_preset() -> None:
-    lines = call("config", "list").stdout.splitlines()
-    assert [line.split()[0] for line in lines] == preset_names()
-    assert all(load_config(line.split()[0]).description in line for line in lines)
-
-
 def test_config_check_counts_and_reads_the_inputs(
     tmp_path: Path, real_files: dict[str, Path]
 ) -> None:
@@ -708,3 +618,17 @@ def test_config_check_counts_and_reads_the_inputs(
     assert done.exit_code == 0
     assert done.stdout == "tiny: valid; 4 racks, 12 servers, 1.93 kW nameplate, site NY\n"
     assert "truncated" in done.stderr
+
+
+def test_progress_is_for_terminals(tmp_path: Path) -> None:
+    pty = pytest.importorskip("pty", reason="pseudo-terminals are for POSIX")
+    shown, terminal = pty.openpty()
+    done = subprocess.run(
+        [*PROGRAM, "simulate", "tiny", "--days", "1", "--out", str(tmp_path / "run")],
+        stdout=subprocess.PIPE, stderr=terminal, env=os.environ | {"TERM": "xterm"}, timeout=120,
+    )  # fmt: skip
+    os.close(terminal)
+    assert done.returncode == 0
+    assert b"simulating" in os.read(shown, 65536)
+    assert b"simulating" not in done.stdout
+    os.close(shown)

@@ -66,13 +66,6 @@ def test_a_suite_is_printed_as_it_would_be_run() -> None:
     assert values["cases"]["eight-sites"]["weeks"] == [3, 27]
 
 
-def test_the_suites_are_listed() -> None:
-    done = call("list")
-    assert done.exit_code == 0
-    names = [line.split()[0] for line in done.stdout.splitlines()]
-    assert {"carbon", "carbon-rich", "bill", "failures", "elsewhere"} <= set(names)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -92,7 +92,7 @@ def test_without_an_optimum_there_is_no_share(runs: Path, monkeypatch: pytest.Mo
     assert done.exit_code == 2, done.output
     assert done.stderr.splitlines() == [
         "note: no optimum, so no shares: no plan",
-        "error: evaluate: no optimum to tell shares of; valid without is --no-optimum",
+        "error: evaluate: no optimum, so no shares; valid without an optimum is --no-optimum",
     ]
     content = json.loads(done.stdout)
     assert [row["controller"] for row in content["summary"]] == ["idle", "happo"]

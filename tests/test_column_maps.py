@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import typer.main
 from typer.testing import CliRunner, Result
 
 import exogenous_builders as build
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import load_site, read_carbon, read_epw, read_workload
-from sdc_taichi.exogenous.columns import COLUMN_NAMES, column_map
-from sdc_taichi.exogenous.fetch.saved_tables import saved_table_services
+from sdc_taichi.exogenous.columns import column_map
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
 PLACE = Place("roof", 40.7, -75.0, 10.0, -5.0)
@@ -182,19 +179,6 @@ def test_stamps_with_an_offset_are_moved(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ends.outdoor_c.values, expected.outdoor_c.values)
 
 
-def test_dew_point_without_pressure(tmp_path: Path) -> None:
-    table = tmp_path / "a.csv"
-    table.write_text(build.text(weather_lines()))
-    columns = dict(text.split("=") for text in WEATHER[:3])
-    weather = read_weather_table(table, PLACE._replace(elevation_m=1000.0), columns=columns)
-    assert weather.pressure_pa is not None
-    # Standard atmosphere at 1,000 m: 89.87 kPa.
-    np.testing.assert_allclose(weather.pressure_pa.values, 89_875, atol=2)
-    assert "pressure of the standard atmosphere at 1000 m" in weather.outdoor_c.notes
-    below = weather.outdoor_c.values - weather.wet_bulb_c.values
-    assert 0.0 < below.min() < below.max() < 8.0  # the dew point is 8 K below the dry bulb
-
-
 def test_import_a_weather_table(tmp_path: Path, user_folder: Path) -> None:
     table = tmp_path / "roof.csv"
     table.write_text(build.text(weather_lines()))
@@ -283,20 +267,6 @@ def test_weather_tables_that_say_too_little(
     assert not user_folder.exists()
 
 
-def test_a_table_with_the_names_of_the_reader_needs_no_map(
-    tmp_path: Path, user_folder: Path
-) -> None:
-    table = tmp_path / "roof.csv"
-    lines = [line.split(",") for line in build.epw_lines()[8:]]
-    rows = [f"{y}-{int(m):02d}-{int(d):02d} {int(h) - 1:02d}:00,{x},60"
-            for y, m, d, h, _, _, x, *_ in lines]  # fmt: skip
-    table.write_text(build.text(["timestamp,dry_bulb,relative_humidity", *rows]))
-    with pytest.raises(DataError, match="a weather table, expected --latitude"):
-        run(str(table), "--site", "roof")
-    assert run(str(table), "--site", "roof", "--base", "NY", *STATION).exit_code == 0
-    assert load_site("roof").outdoor_c.values.max() > 20.0
-
-
 @pytest.mark.parametrize("kind", ["epw", "carbon", "service"])
 def test_a_place_beside_other_files_is_refused(
     kind: str, tmp_path: Path, user_folder: Path
@@ -314,11 +284,3 @@ def test_several_files_need_a_service(tmp_path: Path, user_folder: Path) -> None
         (tmp_path / f"{name}.csv").write_text("avg_CI\n1\n")
     with pytest.raises(DataError, match="2 files: expected one, or tables of one service"):
         run(str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--site", "x")
-
-
-def test_help_names_every_column() -> None:
-    commands: Any = typer.main.get_command(data_app)
-    (option,) = (each for each in commands.commands["import"].params if each.name == "mapped")
-    fuels = {"WND", "SUN", "WAT", "OIL", "NG", "COL", "NUC", "OTH"}
-    missing = [name for name in (*COLUMN_NAMES, *saved_table_services()) if name not in option.help]
-    assert set(missing) == fuels

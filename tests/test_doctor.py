@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -89,22 +87,6 @@ def completed(*words: str) -> list[str]:
     done = CliRunner().invoke(app, [], env=environment, prog_name="sdc-taichi")
     assert (done.exit_code, done.stderr) == (0, "")
     return done.stdout.split()
-
-
-def test_bash_asks_the_program() -> None:
-    """In a process of its own, by the name that the printed script gives."""
-    code = "from sdc_taichi.cli.app import main; import sys; sys.argv[0] = 'sdc-taichi'; main()"
-    script = CliRunner().invoke(app, ["--show-completion", "bash"], prog_name="sdc-taichi").output
-    variable = script.split("=complete_bash")[0].split()[-1]
-    environment = os.environ | {
-        variable: "complete_bash",
-        "COMP_WORDS": "sdc-taichi optim",
-        "COMP_CWORD": "1",
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert (done.stdout, done.stderr) == ("optimum\n", "")
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
+from sdc_taichi.exogenous import (
+    read_carbon,
+    read_epw,
+    read_workload,
+    site_from_files,
+    statistics,
+    wet_bulb_c,
+)
 from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.exogenous.stamps import Stamp
@@ -50,20 +58,6 @@ def test_the_sun_of_another_region_is_warned_of(
     found = [note for note in series.notes if "another region" in note]
     assert len(found) == warned
     assert all("warning: solar generation is centred" in note for note in found)
-
-
-def test_a_grid_without_emissions_is_taken(tmp_path: Path) -> None:
-    stamps = [line.split(",")[0] for line in build.carbon_lines()[1:]]
-    plain = ["timestamp,avg_CI", *(f"{stamp},0" for stamp in stamps)]
-    wind = [build.CARBON_HEADER, *(f"{stamp},900,0,0,0,0,0,0,0,11" for stamp in stamps)]
-    assert read_carbon(write(tmp_path / "zero.csv", plain), -5.0).values.max() == 0.0
-    assert read_carbon(write(tmp_path / "wind.csv", wind), -5.0).values.max() == 11.0
-
-
-def test_the_wrong_stamp_is_an_hour_off(tmp_path: Path) -> None:
-    path = write(tmp_path / "ci.csv", build.carbon_lines(marks="end"))
-    right, wrong = read_carbon(path, -5.0, "end"), read_carbon(path, -5.0, "start")
-    np.testing.assert_array_equal(wrong.values, np.roll(right.values, 1))
 
 
 @pytest.mark.parametrize(("first", "second"), [("start", "end"), ("end", "start")])
@@ -351,31 +345,6 @@ def test_workload_gaps_are_interpolated(tmp_path: Path) -> None:
     assert series.values[48] == pytest.approx(middle)
 
 
-# Measured files, if SDC_REAL_DATA names their folder
-
-STATES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
-LOCATIONS = {
-    "AZ": (33.428, -112.004, -7.0, 337.4),
-    "CA": (37.359, -121.924, -8.0, 15.5),
-    "GA": (33.63, -84.442, -5.0, 307.9),
-    "IL": (41.96, -87.932, -6.0, 201.8),
-    "NY": (40.779, -73.88, -5.0, 3.4),
-    "TX": (32.898, -97.019, -6.0, 170.7),
-    "VA": (39.078, -77.558, -5.0, 119.0),
-    "WA": (47.444, -122.314, -8.0, 137.0),
-}
-BLANK_ROWS = {"CA": 3, "IL": 3, "VA": 23}
-OLD_PAIRING_ERROR = {"CA": 0.58, "AZ": 0.19}
-
-
-def epw_of(real_data: Path, state: str) -> Path:
-    return next((real_data / "weather").glob(f"USA_{state}_*.epw"))
-
-
-def carbon_of(real_data: Path, state: str) -> Path:
-    return real_data / "carbon" / f"{state}_NG_&_avgCI.csv"
-
-
 def test_design_conditions_are_those_of_the_header(tmp_path: Path) -> None:
     lines = list(build.epw_lines())
     assert read_epw(write(tmp_path / "none.epw", lines)).design is None
@@ -406,107 +375,6 @@ def test_a_pressure_that_does_not_fit_the_elevation_is_told(tmp_path: Path) -> N
     )
 
 
-@pytest.mark.parametrize("state", STATES)
-def test_measured_weather(state: str, real_data: Path) -> None:
-    weather = read_epw(epw_of(real_data, state))
-    found = (
-        weather.latitude_deg,
-        weather.longitude_deg,
-        weather.utc_offset_h,
-        weather.elevation_m,
-    )
-    assert found == LOCATIONS[state]
-    constant = any("nearly constant" in note for note in weather.outdoor_c.notes)
-    assert constant == (state == "VA")
-    assert len(weather.outdoor_c.notes) == int(constant)
-    compare(state, "outdoor_c", statistics(weather.outdoor_c), 1e-3)
-    compare(state, "wet_bulb_c", statistics(weather.wet_bulb_c), 1e-3)
-
-
-@pytest.mark.parametrize("state", STATES)
-def test_measured_carbon(state: str, real_data: Path) -> None:
-    _, longitude, offset, _ = LOCATIONS[state]
-    series = read_carbon(carbon_of(real_data, state), offset, longitude_deg=longitude)
-    text = "; ".join(series.notes)
-    blank = BLANK_ROWS.get(state)
-    assert (f"{blank} rows without values" in text) if blank else ("rows without" not in text)
-    assert ("5 rows with under half" in text) == (state == "VA")
-    assert ("559 rows with no nuclear but high OTH" in text) == (state == "NY")
-    assert ("12 rows with one fuel only" in text) == (state == "WA")
-    assert ("2 rows with over twice" in text) == (state == "AZ")
-    marks = {
-        "VA": "mark the start of the interval (solar noon)",
-        "CA": "mark the start until 2022-06-14, then the end",
-        "NY": "mark the end of the interval (assumed: no solar generation)",
-    }
-    assert marks.get(state, "mark the end of the interval (solar noon)") in text
-    np.testing.assert_array_equal(
-        series.values, read_carbon(carbon_of(real_data, state), offset).values
-    )
-    # The fitted statistics also repaired what is only warned of here, so those are wider.
-    compare(state, "ci_g_per_kwh", statistics(series), 0.05 if state in ("NY", "VA") else 5e-3)
-
-
-@pytest.mark.parametrize("state", list(OLD_PAIRING_ERROR))
-def test_measured_carbon_in_the_old_pairing(state: str, real_data: Path) -> None:
-    _, longitude, offset, _ = LOCATIONS[state]
-    path = carbon_of(real_data, state)
-    aligned = read_carbon(path, offset, longitude_deg=longitude).values.reshape(365, 24)
-    paired = read_carbon(path, offset, pairing="utc_rows").values.reshape(365, 24)
-    error = paired[:, 10:16].mean() / aligned[:, 10:16].mean() - 1.0
-    assert error == pytest.approx(OLD_PAIRING_ERROR[state], abs=0.01)
-
-
-def test_measured_carbon_without_first_header_and_final_newline(real_data: Path) -> None:
-    path = real_data / "carbon" / "WAAT_NG_&_avgCI.csv"
-    series = read_carbon(path, -8.0)
-    assert "blank first header read as timestamp" in series.notes
-    plain = read_carbon(carbon_of(real_data, "WA"), -8.0)
-    assert np.corrcoef(series.values, plain.values)[0, 1] > 0.99
-
-
-@pytest.mark.parametrize(
-    ("name", "rows_cut", "repeats", "mean"),
-    [
-        ("Alibaba_CPU_Data_Hourly_1.csv", 144, True, 0.49532),
-        ("Alibaba_CPU_Data_Hourly_2.csv", 144, True, 0.31516),
-        ("GoogleClusteData_CPU_Data_Hourly_1.csv", 0, False, 0.67940),
-    ],
-)
-def test_measured_workload(
-    name: str, rows_cut: int, repeats: bool, mean: float, real_data: Path
-) -> None:
-    series = read_workload(real_data / "workload" / name)
-    assert series.values.shape == (8760,)
-    text = "; ".join(series.notes)
-    assert ("168 rows repeat 53 times" in text) == repeats
-    assert (f"({rows_cut} rows cut)" in text) == bool(rows_cut)
-    assert series.values.mean() == pytest.approx(mean, abs=1e-3)
-
-
-def compare(state: str, quantity: str, found: dict[str, float], tolerance: float) -> None:
-    from test_exogenous_synthetic import REAL
-
-    for statistic, real in REAL[quantity][state].items():
-        allowed = tolerance * max(abs(real), 0.1)
-        assert found[statistic] == pytest.approx(real, abs=allowed), statistic
-
-
-def test_missing_folder_and_bad_arguments(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such file"):
-        read_epw(tmp_path / "absent.epw")
-    path = write(tmp_path / "ci.csv", build.carbon_lines())
-    for kwargs, message in (
-        ({"utc_offset_h": 20.0}, "utc_offset_h"),
-        ({"utc_offset_h": -5.0, "stamp": "middle"}, "stamp"),
-        ({"utc_offset_h": -5.0, "pairing": "rows"}, "pairing"),
-    ):
-        with pytest.raises(DataError, match=message):
-            read_carbon(path, **kwargs)
-    with pytest.raises(DataError, match="minutes"):
-        read_workload(path, minutes=0.0)
-
-
 def test_series_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "new" / "x.parquet"
     write_parquet(path, {"x": np.arange(3.0)}, {"kind": "weather"})
@@ -520,3 +388,41 @@ def test_series_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["x.parquet"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "new"]
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("state", ["AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA"])
+def test_measured_files_have_the_statistics_that_years_are_fitted_to(
+    state: str, real_data: Path
+) -> None:
+    """Only where SDC_REAL_DATA names a folder of measured files."""
+    from test_exogenous_synthetic import REAL
+
+    site = site_from_files(
+        None,
+        next((real_data / "weather").glob(f"USA_{state}_*.epw")),
+        real_data / "carbon" / f"{state}_NG_&_avgCI.csv",
+    )
+    # The fitted statistics also repaired what is only warned of here, so those are wider.
+    carbon = 0.05 if state in ("NY", "VA") else 5e-3
+    for series, tolerance in (
+        (site.outdoor_c, 1e-3), (site.wet_bulb_c, 1e-3), (site.ci_g_per_kwh, carbon)
+    ):  # fmt: skip
+        found = statistics(series)
+        for statistic, real in REAL[series.name][state].items():
+            allowed = tolerance * max(abs(real), 0.1)
+            assert found[statistic] == pytest.approx(real, abs=allowed), statistic
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"utc_offset_h": 20.0}, "utc_offset_h"),
+        ({"utc_offset_h": -5.0, "stamp": "middle"}, "stamp"),
+        ({"utc_offset_h": -5.0, "pairing": "rows"}, "pairing"),
+    ],
+)
+def test_arguments_that_are_not_valid(
+    arguments: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match=message):
+        read_carbon(tmp_path / "ci.csv", **arguments)

@@ -91,16 +91,6 @@ def test_pressure_of_a_site_follows_from_its_height(sources: Path, user_folder: 
             site_pressure_pa(**bad)
 
 
-def test_embedded_names(user_folder: Path) -> None:
-    assert site_names() == ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
-    assert trace_names() == ("alibaba_1", "alibaba_2", "google_1")
-
-
-def test_names_ignore_case() -> None:
-    assert load_site("ny") is load_site("NY")
-    assert load_trace("Google_1") is load_trace("google_1")
-
-
 def test_unknown_names_suggest_the_nearest(user_folder: Path) -> None:
     with pytest.raises(DataError, match=r"site 'NYC': expected one of AZ.*nearest: NY"):
         load_site("NYC")
@@ -336,21 +326,3 @@ def test_show_draws_a_picture(tmp_path: Path, user_folder: Path) -> None:
         run("show", "VA", "--out", str(tmp_path / "va.xyz"))
     with pytest.raises(SdcError, match="cannot be written"):
         run("show", "VA", "--out", str(tmp_path / "absent" / "va.png"))
-
-
-def test_a_picture_without_matplotlib(
-    tmp_path: Path, user_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in [m for m in sys.modules if m.split(".")[0] == "matplotlib"]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(DataError, match=r'pip install "sdc-taichi\[plot\]"'):
-        run("show", "VA", "--out", str(tmp_path / "va.png"))
-
-
-def test_import_measured_files(real_data: Path, user_folder: Path) -> None:
-    output = run("import", str(real_data)).output
-    assert "left out" in output
-    assert "WAAT" in output
-    for state in ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA"):
-        assert not load_site(f"{state}-real").synthetic

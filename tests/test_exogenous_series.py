@@ -76,16 +76,6 @@ def test_the_wrap_is_periodic() -> None:
     np.testing.assert_allclose(out[-4:], [10.0, 14.0, 15.0, 13.0])
 
 
-def test_holding_repeats_values() -> None:
-    out = resample(series([1.0, 3.0], 30.0), 12, hold=True)
-    np.testing.assert_array_equal(out, np.repeat([1.0, 3.0], 6))
-
-
-def test_the_same_step_returns_the_values() -> None:
-    out = resample(series(YEAR, 15.0), 4)
-    np.testing.assert_array_equal(out, YEAR)
-
-
 def test_coarser_steps_average() -> None:
     five = np.random.default_rng(1).random(365 * 288)
     out = resample(series(five, 5.0), 4)
@@ -97,13 +87,6 @@ def test_coarser_steps_that_do_not_nest_average_by_overlap() -> None:
     out = resample(series([0.0, 12.0, 24.0, 36.0], 15.0), 3)
     # 20 minutes: 15 of the first and 5 of the second, 10 and 10, 5 and 15.
     np.testing.assert_allclose(out, [3.0, 18.0, 33.0])
-
-
-def test_three_years_of_five_minutes() -> None:
-    values = np.random.default_rng(2).random(3 * 365 * 288)
-    out = resample(series(values, 5.0), 1)
-    assert out.shape == (3 * 8760,)
-    assert out.mean() == pytest.approx(values.mean(), abs=1e-12)
 
 
 def test_a_rest_of_a_step_is_rejected() -> None:

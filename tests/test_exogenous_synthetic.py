@@ -116,11 +116,6 @@ CASES = [
 ]
 
 
-def test_every_statistic_of_every_place_is_compared() -> None:
-    assert len(CASES) == 27 * len(synthetic_sites()) + 24
-    assert all(set(REAL[q][p]) == set(TOLERANCE[q]) for q, p, _ in CASES)
-
-
 @pytest.mark.parametrize(("quantity", "place", "statistic"), CASES)
 def test_synthetic_years_hold_the_tolerances(
     quantity: str,
@@ -134,15 +129,6 @@ def test_synthetic_years_hold_the_tolerances(
     assert miss(statistic, float(np.mean(per_seed)), real) <= allowed, "mean of the seeds"
     worst = max(miss(statistic, x, real) for x in per_seed)
     assert worst <= 2.0 * allowed, "a seed"
-
-
-def test_the_exception_is_needed(
-    synthetic_statistics: dict[tuple[str, str], list[dict[str, float]]],
-) -> None:
-    for quantity, place, statistic in EXCEPTIONS:
-        per_seed = [s[statistic] for s in synthetic_statistics[quantity, place]]
-        found = miss(statistic, float(np.mean(per_seed)), REAL[quantity][place])
-        assert found > TOLERANCE[quantity][statistic]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -186,13 +172,6 @@ def test_solar_sites_are_cleanest_around_local_noon() -> None:
 
 
 # Bit stability
-
-
-def test_random_bits_are_those_of_pcg64() -> None:
-    """The raw bits are guaranteed by NumPy, so these hold on every version and machine."""
-    bits = np.random.PCG64(np.random.SeedSequence([10, 0, 1])).random_raw(1000)
-    digest = hashlib.sha256(bits.astype("<u8").tobytes()).hexdigest()
-    assert digest == "2db4e3be0db6e6d2e07ad970b475532f6616b3f8f6cdcd95293691b85c2f6f0e"
 
 
 def test_normals_are_normal_and_independent_between_sites_and_streams() -> None:

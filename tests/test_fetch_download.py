@@ -152,11 +152,6 @@ def test_large_answers_are_refused() -> None:
     assert "more than 1.0 MB" in failure(packed, most_bytes=1_000_000)
 
 
-def test_a_compressed_answer_is_unpacked() -> None:
-    with serving(sends(gzip.compress(CONTENT), Content_Encoding="gzip")) as server:
-        assert download(request_to(server.url), QUICK) == CONTENT
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -190,16 +185,6 @@ def test_the_key_is_neither_logged_nor_kept(
         assert path.is_dir() or SECRET.encode() not in path.read_bytes()
     assert SECRET not in repr(request_to("", key=SECRET))
     assert b'"api_key": "KEY"' in kept.content
-
-
-def test_netrc_is_not_sent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    netrc = tmp_path / "netrc"
-    netrc.write_text("machine 127.0.0.1 login me password mine\n")
-    netrc.chmod(0o600)
-    monkeypatch.setenv("NETRC", str(netrc))
-    with serving(sends(CONTENT)) as server:
-        download(request_to(server.url), QUICK)
-    assert "Authorization" not in server.seen[0][1]
 
 
 def test_a_second_fetch_needs_no_network(tmp_path: Path) -> None:
@@ -242,20 +227,6 @@ def test_nothing_is_kept_of_a_bad_answer(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == []
 
 
-def test_fetching_goes_on_after_a_failure(tmp_path: Path) -> None:
-    done: list[tuple[int, int]] = []
-    with serving(sends(CONTENT), sends(b"", 404), sends(CONTENT)) as server:
-        asked = [request_to(server.url, file_name=f"{i}.json") for i in range(2)]
-        with pytest.raises(DataError, match="404"):
-            fetch(asked, tmp_path, patience=QUICK)
-        found = fetch(
-            asked, tmp_path, patience=QUICK, progress=lambda now, total: done.append((now, total))
-        )
-    assert len(found) == 2
-    assert len(server.seen) == 3
-    assert done == [(0, 2), (1, 2), (2, 2)]
-
-
 @pytest.mark.parametrize("value", ["", "  ", "abc", "has space 123", "naïve-key-123", "x" * 300])
 def test_what_is_no_key_is_refused_without_showing_it(
     monkeypatch: pytest.MonkeyPatch, value: str
@@ -264,3 +235,13 @@ def test_what_is_no_key_is_refused_without_showing_it(
     with pytest.raises(DataError, match=r"TEST_KEY.*https://example.org/key") as raised:
         read_key(SERVICE)
     assert not value.strip() or value not in str(raised.value)
+
+
+def test_netrc_is_not_sent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    netrc = tmp_path / "netrc"
+    netrc.write_text("machine 127.0.0.1 login me password mine\n")
+    netrc.chmod(0o600)
+    monkeypatch.setenv("NETRC", str(netrc))
+    with serving(sends(CONTENT)) as server:
+        download(request_to(server.url), QUICK)
+    assert "Authorization" not in server.seen[0][1]

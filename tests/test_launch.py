@@ -16,7 +16,7 @@ from taichi.lang.exception import TaichiCompilationError
 
 from sdc_taichi import ConfigError
 from sdc_taichi.kernels.compiler.arrays import aligned
-from sdc_taichi.kernels.compiler.launch import OPTIONS, BoundKernel, run_once
+from sdc_taichi.kernels.compiler.launch import OPTIONS, BoundKernel
 from sdc_taichi.kernels.compiler.runtime import ensure_started, uses_plain_taichi
 
 VECTORS = ti.types.ndarray(dtype=ti.types.vector(4, ti.f64), ndim=1)
@@ -146,15 +146,3 @@ def test_the_switch_is_0_or_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDC_TAICHI_PLAIN", "yes")
     with pytest.raises(ConfigError, match="SDC_TAICHI_PLAIN='yes': valid are 0 and 1"):
         BoundKernel(add_scaled, templates=1)
-
-
-def test_kernels_that_are_seldom_called_are_compiled_with_the_same_options() -> None:
-    before = {name: getattr(ti.cfg, name) for name in OPTIONS}
-    found = []
-
-    def kernel(x: int) -> None:
-        found.append((x, {name: getattr(ti.cfg, name) for name in OPTIONS}))
-
-    run_once(kernel, x=3)
-    assert found == [(3, OPTIONS)]
-    assert before == {name: getattr(ti.cfg, name) for name in OPTIONS}

@@ -95,19 +95,6 @@ def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
     np.testing.assert_allclose(sums.rack_inlet_c, 23.0 + d_k_per_w @ power_w, rtol=0, atol=0.1)
 
 
-@pytest.mark.parametrize("full_m3s", [None, 0.02])
-def test_d_holds_at_the_design_point_of_servers_with_curves(
-    full_m3s: float | None, tmp_path: Path
-) -> None:
-    airflow = f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"
-    matrix, path = random_matrix(np.random.default_rng(0), 6), tmp_path / "cfd.npz"
-    d_k_per_w = heat_matrix(matrix, "none", tmp_path, airflow)
-    np.savez(path, D=d_k_per_w)
-    sums = at_design([hall_with(path, "none", airflow)])
-    rise_k = d_k_per_w @ (sums.rack_cpu_w + sums.rack_fan_w)
-    np.testing.assert_allclose(sums.rack_inlet_c - 23.0, rise_k, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -322,7 +322,7 @@ def test_served_run_is_served_until_it_is_ended(tmp_path: Path) -> None:
             assert process.stderr.readline().startswith(
                 "serving the run; watch it with: sdc-taichi"
             )
-            assert "the run is done and still served" in process.stderr.readline()
+            assert "the run is finished and still served" in process.stderr.readline()
             assert listens(served_at(port))
             assert (out / "metrics.json").exists()
             process.send_signal(signal.SIGINT)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
-import shlex
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -17,8 +16,6 @@ import yaml
 pytestmark = pytest.mark.repo
 
 ROOT = Path(__file__).parent.parent
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-TARGETS = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text("utf-8"), re.M)
 
 
 def load(path: str) -> ModuleType:
@@ -28,56 +25,6 @@ def load(path: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def workflow(path: Path) -> dict[str, Any]:
-    # YAML 1.1 reads the key `on` as true.
-    found: dict[str, Any] = yaml.load(path.read_text("utf-8"), yaml.BaseLoader)
-    return found
-
-
-def steps(path: Path) -> list[dict[str, Any]]:
-    return [step for job in workflow(path)["jobs"].values() for step in job["steps"]]
-
-
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_workflows_have_least_rights_and_pinned_actions(path: Path) -> None:
-    content = workflow(path)
-    assert content["permissions"] == {}
-    assert "concurrency" in content
-    for job in content["jobs"].values():
-        assert job["permissions"]
-        assert int(job["timeout-minutes"]) <= 60
-    for line in re.findall(r"uses: (.*)", path.read_text("utf-8")):
-        assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", line), line
-    for step in steps(path):
-        if step.get("uses", "").startswith("actions/checkout@"):
-            assert step["with"]["persist-credentials"] == "false"
-        # Names of branches and tags come from outside: shells read them from the environment.
-        assert "${{" not in step.get("run", "")
-
-
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_workflows_name_targets_and_files_that_exist(path: Path) -> None:
-    text = path.read_text("utf-8")
-    named = {*re.findall(r"\bmake ([a-z-]+)", text), *re.findall(r"target: ([a-z-]+)", text)}
-    assert named <= {*TARGETS}
-    files = re.findall(r"(?:\.ci|docs/site)/[\w.-]+", text)
-    assert [name for name in files if not (ROOT / name).is_file()] == []
-
-
-def test_tests_cover_what_the_package_is_offered_for() -> None:
-    project = load_project()
-    jobs = workflow(ROOT / ".github/workflows/tests.yml")["jobs"]
-    matrix = jobs["newest-libraries"]["strategy"]["matrix"]
-    listed = [x.rpartition(" ")[2] for x in project["classifiers"] if "Python :: 3." in x]
-    assert matrix["python"] == listed
-    assert [re.sub(r"-.*", "", x) for x in matrix["system"]] == ["ubuntu", "macos", "windows"]
-    run = (ROOT / ".ci" / "run").read_text("utf-8")
-    (targets,) = re.findall(r"for target in (.*);", run)
-    elsewhere = {"docs", "test"}
-    checked = {x["target"] for x in jobs["checks"]["strategy"]["matrix"]["include"]}
-    assert checked | elsewhere == {*targets.split()}
 
 
 def load_project() -> dict[str, Any]:
@@ -151,19 +98,6 @@ def test_sites_of_versions_stand_side_by_side(tmp_path: Path) -> None:
     assert 'url=0.10.0/"' in (pages / "index.html").read_text()
     with pytest.raises(SystemExit, match="expected dev or a version"):
         put(pages, build, "../dev", address)
-
-
-def test_the_container_gets_what_the_package_is_built_from() -> None:
-    ignored = (ROOT / ".dockerignore").read_text("utf-8").splitlines()
-    kept = {line[1:] for line in ignored if line.startswith("!")}
-    folders = {"configs", "data", "kernels", "sdc_taichi", "viz"}
-    files = {"LICENSE", "README.md", "pyproject.toml"}
-    assert kept == folders | files
-    recipe = (ROOT / "Containerfile").read_text("utf-8")
-    assert re.search(r"^USER (?!0)\d+", recipe, re.M)
-    (entry,) = re.findall(r"^ENTRYPOINT (.*)", recipe, re.M)
-    assert json.loads(entry)[0] in load_project()["scripts"]
-    assert shlex.split(re.findall(r"^COPY --from=build (.*)", recipe, re.M)[0])[0] in recipe
 
 
 def test_the_recipe_requires_what_the_package_requires() -> None:

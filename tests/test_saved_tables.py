@@ -225,17 +225,6 @@ def test_hours_that_clocks_skip_are_left_out(tmp_path: Path) -> None:
         imported([path], "entsoe", tmp_path / "user")
 
 
-def test_months_of_watttime_are_joined(tmp_path: Path) -> None:
-    paths = watttime(tmp_path)
-    item = import_saved_tables(paths, "watttime", "x", data_dir=tmp_path / "user", utc_offset_h=0.0)
-    series = read_carbon(item.target, 0.0)
-    stamps = np.arange(365 * 288)
-    expected = 0.45359237 * np.round(800 + 200 * np.sin(stamps / 500), 3)
-    assert series.minutes == 5.0
-    np.testing.assert_allclose(series.values, expected, atol=1e-3)
-    assert any("marginal intensity" in note for note in item.notes)
-
-
 def test_years_of_electricity_maps_are_joined(tmp_path: Path) -> None:
     paths = electricity_maps(tmp_path)
     item = import_saved_tables(
@@ -321,3 +310,14 @@ def test_a_half_year_alone_is_too_short(tmp_path: Path) -> None:
         imported(paths[:1], "eia-930", tmp_path / "user", "CISO")
     with pytest.raises(DataError, match="comes twice"):
         imported([paths[0], paths[0]], "eia-930", tmp_path / "user", "CISO")
+
+
+def test_months_of_watttime_are_joined(tmp_path: Path) -> None:
+    paths = watttime(tmp_path)
+    item = import_saved_tables(paths, "watttime", "x", data_dir=tmp_path / "user", utc_offset_h=0.0)
+    series = read_carbon(item.target, 0.0)
+    stamps = np.arange(365 * 288)
+    expected = 0.45359237 * np.round(800 + 200 * np.sin(stamps / 500), 3)
+    assert series.minutes == 5.0
+    np.testing.assert_allclose(series.values, expected, atol=1e-3)
+    assert any("marginal intensity" in note for note in item.notes)

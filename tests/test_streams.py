@@ -54,16 +54,6 @@ def test_shown_configs_are_safe_to_print_and_read_back_equal(tmp_path: Path) -> 
     assert sdc_taichi.load_config(str(tmp_path / "mine.yaml")) == config
 
 
-def test_any_name_may_stand_in_a_picture(tmp_path: Path) -> None:
-    plan = tmp_path / "plan.png"
-    done = CliRunner().invoke(
-        app.app, ["hall", "show", "tiny", r'name="$x_{ \e[2J 工"', "--out", str(plan)]
-    )
-    assert (done.exit_code, done.stderr) == (0, "")
-    assert done.stdout.startswith(r"$x_{ \x1b[2J 工: 2 rows of 2 racks")
-    assert plan.read_bytes()[1:4] == b"PNG"
-
-
 @POSIX
 def test_a_full_device_is_one_error() -> None:
     with open("/dev/full", "w") as full:

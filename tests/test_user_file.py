@@ -6,7 +6,6 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.run.folder_reader import read_run
-from sdc_taichi.run.folder_writer import prepare_folder
 from sdc_taichi.sim import snapshot
 from sdc_taichi.user_file import decoding, open_input, read_text
 
@@ -68,12 +66,6 @@ def test_a_run_folder_is_read_as_carefully(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-def test_a_folder_with_a_pipe_for_metrics_is_no_run_folder(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "metrics.json")
-    with pytest.raises(SdcError, match=r"holds files that are not of a run \(metrics\.json\)"):
-        prepare_folder(tmp_path)
-
-
 def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "state.npz"
     np.savez_compressed(path, soc=np.zeros(1_000_000))
@@ -83,19 +75,6 @@ def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> 
         file.writestr("soc.npy", b"\x93NUMPY\x02\x00" + (1 << 30).to_bytes(4, "little"))
     with pytest.raises(SdcError, match=r"state\.npz: cannot be read as array soc"):
         snapshot.read(path)
-
-
-def test_a_file_that_holds_more_than_it_says_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, empty = tmp_path / "a.yaml", tmp_path / "empty.yaml"
-    path.write_bytes(b"x" * 101)
-    empty.touch()
-    status = os.stat(empty)
-    monkeypatch.setattr("sdc_taichi.user_file.os", SimpleNamespace(stat=lambda path: status))
-    with pytest.raises(DataError, match=r"a\.yaml: has more than 0\.0 MB, the most that is valid"):
-        read_text(path, 100, DataError)
-    assert read_text(path, 101) == "x" * 101
 
 
 def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
@@ -147,11 +126,6 @@ def test_numbers_of_yaml_are_decimal() -> None:
 def test_a_merge_key_is_a_key_like_any_other() -> None:
     rows = "a: &a {k: 1}\nb: {<<: *a, k: 2}\nc: ="
     assert load_yaml(rows) == {"a": {"k": 1}, "b": {"<<": {"k": 1}, "k": 2}, "c": "="}
-
-
-def test_texts_that_are_numbers_are_taken() -> None:
-    config = load_config("tiny", ["hvac.chiller.reference_cop='5.5'", "name=1_000"])
-    assert (config.hvac.chiller.reference_cop, config.name) == (5.5, "1_000")
 
 
 @pytest.mark.parametrize("text", ["²", "0", "1_0", "١", "99999", "-1", "1.0"])

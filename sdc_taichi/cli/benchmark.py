@@ -90,7 +90,7 @@ def run_command(
 ) -> None:
     """Run the controllers of a suite in held-out weeks, trained ones with several seeds.
 
-    Results are kept job by job, so --resume runs what is missing.
+    The result of each job is stored, so --resume runs what is missing.
     """
     from sdc_taichi.benchmark.cases import check_suite
     from sdc_taichi.benchmark.store import ResultStore
@@ -144,8 +144,8 @@ def report_command(
 ) -> None:
     """Make tables and pictures of suites: one HTML page, and Markdown.
 
-    Results of one suite may lie in several folders. Nothing is run. Rows share a place unless 95 %
-    intervals tell them apart.
+    Results of one suite may be in several folders. Nothing is run. Rows whose 95 % confidence
+    intervals overlap share a rank.
     """
     from sdc_taichi.benchmark.report import write_report
 
@@ -178,10 +178,10 @@ def add_command(
         ),
     ] = 0,
 ) -> None:
-    """Check a row that somebody else has run, and add it to the results of a suite.
+    """Check a row that was run elsewhere, and add it to the results of a suite.
 
-    The row has to be complete and of the same weeks of the same data centers. The documentation
-    of suites says how to make one.
+    The row must be complete, and of the same weeks and data centers. The documentation of suites
+    describes how to make one.
     """
     from sdc_taichi.benchmark.submission import add_submission, read_submission, rerun
 
@@ -195,15 +195,15 @@ def add_command(
 
 
 def _names(text: str | None) -> list[str]:
-    """Names that commas part; none of no text."""
+    """Names separated by commas; none without a text."""
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def _require_torch(suite: Suite) -> None:
-    """See that rows can be trained here, before optima are solved for a long time.
+    """Check that rows can be trained here, before optima are solved for a long time.
 
     Raises:
-        ConfigError: they cannot.
+        ConfigError: PyTorch is missing.
     """
     trained = [name for name, row in suite.rows.items() if row.train is not None]
     if trained and importlib.util.find_spec("torch") is None:

@@ -16,7 +16,7 @@ from sdc_taichi.cli.options import (
     RunOptions,
     SiteOptions,
     Source,
-    complete_controllers,
+    controllers_option,
     force_option,
     out_option,
     read_config,
@@ -36,10 +36,8 @@ def collect_command(
     sites: SiteOptions,
     controller: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Controller as of simulate, or random, optimum, optimum:OBJECTIVE; repeatable.",
-            autocompletion=complete_controllers,
+        controllers_option(
+            "Controller as of simulate, or random, optimum, optimum:OBJECTIVE; repeatable."
         ),
     ] = None,
     weeks: Annotated[
@@ -78,8 +76,8 @@ def collect_command(
 ) -> None:
     """Collect episodes of controllers for offline learning, in Minari's format.
 
-    Writes a data set for each site, with a card: observations, actions, rewards and a few
-    quantities of every step, which the environment in its metadata gives again.
+    Writes a data set and a card for each site: observations, actions, rewards and a few quantities
+    of every step. The environment in its metadata reproduces them.
     """
     from sdc_taichi.benchmark.episodes import Collection
     from sdc_taichi.benchmark.offline import data_set_folder, require_minari, write_data_set
@@ -107,7 +105,7 @@ def collect_command(
         )
         for config in configs
     ]
-    # What is not valid is said before the first episode.
+    # Errors of the input are reported before the first episode.
     for each in names:
         data_set_folder(out, each, replace=force)
     for collection in collections:
@@ -148,12 +146,12 @@ def _environment(assigned: list[str]) -> dict[str, Any]:
                 "follow the preset, as workload.flexible_share=0.4"
             )
         apply_override(values, text)
-    found: dict[str, Any] = values.get("environment", {})
-    return found
+    options: dict[str, Any] = values.get("environment", {})
+    return options
 
 
 def _agent_of(command: str | None) -> str | None:
-    """The agent that gives a command."""
+    """Name of the agent that gives a command."""
     from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
     return next((agent for agent, d in AGENT_DEFINITIONS.items() if d.command == command), None)
@@ -167,12 +165,12 @@ def _names(stem: str, configs: list[DataCenterConfig]) -> list[str]:
 
 
 def _identifier(text: str) -> str:
-    """Text with ``_`` for what Minari takes in no name."""
+    """Text with ``_`` in place of characters that Minari accepts in no name."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text)
 
 
 def _print_summary(made: DataSet) -> None:
-    """Say what a data set holds and where it is."""
+    """Print the content and the place of a data set."""
     from sdc_taichi.benchmark.offline import CARD_FILE
 
     for name in made.collection.controllers:
@@ -184,4 +182,4 @@ def _print_summary(made: DataSet) -> None:
             f"{row['mean_return']:.2f}{text}"
         )
     folder = printable(made.folder)
-    print(f"{made.id} in {folder}; {CARD_FILE} there tells what it holds and how to load it")
+    print(f"{made.id} in {folder}; {CARD_FILE} there describes it and how to load it")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,8 +26,8 @@ from sdc_taichi.exogenous.registry import (
     trace_names,
     user_data_dir,
 )
-from sdc_taichi.exogenous.series import DesignConditions, Series
-from sdc_taichi.exogenous.statistics import statistics
+from sdc_taichi.exogenous.series import DesignConditions, Series, statistics
+from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
     synthetic_site,
@@ -46,14 +45,6 @@ Seed = Annotated[int, typer.Option(help="Seed of the synthetic year.", min=0)]
 
 def _sites_and_traces() -> list[str]:
     return [*site_names(), *trace_names()]
-
-
-class StampOption(StrEnum):
-    """Meaning of a stamp of a carbon file: the start or the end of its interval."""
-
-    AUTO = "auto"
-    START = "start"
-    END = "end"
 
 
 @data_app.command("list")
@@ -108,14 +99,14 @@ def show_data(
 ) -> None:
     """Show the statistics of a site or a workload trace, and a picture of it."""
     console = PlainConsole()
-    found = find_name("site or trace", name, (*site_names(), *trace_names()))
-    if found in site_names():
-        site = load_site(found, seed=seed)
-        title = f"{found}: {site.label}, UTC{site.utc_offset_h:+g} h, {site.elevation_m:g} m"
+    name = find_name("site or trace", name, (*site_names(), *trace_names()))
+    if name in site_names():
+        site = load_site(name, seed=seed)
+        title = f"{name}: {site.label}, UTC{site.utc_offset_h:+g} h, {site.elevation_m:g} m"
         series = site.series
         design = _design_text(site.design)
     else:
-        series, title, design = (load_trace(found, seed=seed),), found, ""
+        series, title, design = (load_trace(name, seed=seed),), name, ""
     table = Table("", title=title)
     for s in series:
         table.add_column(f"{s.name.replace('_', ' ')}\n{s.unit}", justify="right")
@@ -196,8 +187,8 @@ def import_data(
         typer.Option(help="Balancing authority or zone, of tables that hold several."),
     ] = None,
     stamp: Annotated[
-        StampOption, typer.Option(help="What a stamp of a carbon or weather table marks.")
-    ] = StampOption.AUTO,
+        Stamp, typer.Option(help="What a stamp of a carbon or weather table marks.")
+    ] = "auto",
     utc_offset: Annotated[
         float | None,
         typer.Option(help="UTC offset (h), of a carbon file without weather or a weather table."),
@@ -239,13 +230,13 @@ def import_data(
                 item = importing.import_weather(file, name, base)
             elif kind == "weather table":
                 place = _place(name, file, utc_offset, where)
-                marks: Literal["start", "end"] = "end" if stamp is StampOption.END else "start"
+                marks: Literal["start", "end"] = "end" if stamp == "end" else "start"
                 item = importing.import_weather(
                     file, name, base, place=place, stamp=marks, columns=columns
                 )
             elif kind == "carbon":
                 item = importing.import_carbon(
-                    file, name, base, utc_offset_h=utc_offset, stamp=stamp.value, columns=columns
+                    file, name, base, utc_offset_h=utc_offset, stamp=stamp, columns=columns
                 )
             else:
                 item = importing.import_workload(file, name, columns=columns)
@@ -289,15 +280,15 @@ def _import_tables(
     site: str | None,
     base: str | None,
     area: str | None,
-    stamp: StampOption,
+    stamp: Stamp,
     utc_offset_h: float | None,
 ) -> importing.Imported:
     """Import tables in the layout of a service."""
     from sdc_taichi.exogenous.fetch.saved_tables import find_service, import_saved_tables
 
     find_service(service)
-    if stamp is not StampOption.AUTO:
-        raise DataError(f"--stamp {stamp.value}: known of the tables of {service}")
+    if stamp != "auto":
+        raise DataError(f"--stamp {stamp}: what stamps mark is known for tables of {service}")
     if site is None:
         raise DataError(f"--map {service}: expected --site NAME to import the tables under")
     return import_saved_tables(paths, service, site, base, area=area, utc_offset_h=utc_offset_h)
@@ -305,19 +296,21 @@ def _import_tables(
 
 def _refuse_place(where: Mapping[str, float | None], path: Path) -> None:
     """Refuse options of a weather table beside other files."""
-    given = [f"--{option}" for option, value in where.items() if value is not None]
-    if given:
-        raise DataError(f"{', '.join(given)}: without effect on {path}, which is no weather table")
+    options = [f"--{option}" for option, value in where.items() if value is not None]
+    if options:
+        raise DataError(
+            f"{', '.join(options)}: without effect on {path}, which is no weather table"
+        )
 
 
 def _place(
     name: str, path: Path, utc_offset_h: float | None, where: Mapping[str, float | None]
 ) -> Place:
     """Where the station of a weather table is."""
-    given = {**where, "utc-offset": utc_offset_h}
-    if missing := [f"--{option}" for option, value in given.items() if value is None]:
+    options = {**where, "utc-offset": utc_offset_h}
+    if missing := [f"--{option}" for option, value in options.items() if value is None]:
         raise DataError(f"{path}: a weather table, expected {', '.join(missing)} of its station")
-    latitude, longitude, elevation, offset = (float(value or 0.0) for value in given.values())
+    latitude, longitude, elevation, offset = (float(value or 0.0) for value in options.values())
     return Place(name, latitude, longitude, elevation, offset)
 
 

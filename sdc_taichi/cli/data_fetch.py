@@ -35,7 +35,9 @@ class TargetOptions:
     base: Annotated[
         str | None, typer.Option(help="Embedded site that gives what the download does not.")
     ] = None
-    refresh: Annotated[bool, typer.Option("--refresh", help="Download again what is kept.")] = False
+    refresh: Annotated[bool, typer.Option("--refresh", help="Download again what is stored.")] = (
+        False
+    )
 
     def fetch(self, fetch: Callable[[Destination], Imported]) -> None:
         """Fetch with a progress bar, and print what was imported.
@@ -66,7 +68,7 @@ class YearOptions:
     year: Annotated[
         int,
         typer.Option(
-            "--year", metavar="YYYY", help="Calendar year, one that is over.", show_default=False
+            "--year", metavar="YYYY", help="Calendar year in the past.", show_default=False
         ),
     ]
     utc_offset: Annotated[
@@ -181,7 +183,7 @@ def print_imported(console: PlainConsole, item: Imported) -> None:
 
 
 def print_missing_parts(console: PlainConsole, done: Sequence[Imported], base: str | None) -> None:
-    """Say of each imported site that lacks weather or carbon where that comes from."""
+    """Print, for each imported site without weather or carbon, the source of that part."""
     for name in dict.fromkeys(item.name for item in done if item.kind != "workload"):
         missing = {"weather", "carbon"} - set(imported_sites().get(name, {}))
         if not missing:

@@ -1,4 +1,4 @@
-"""``sdc-taichi doctor``: what this machine offers to the package, and what is missing."""
+"""``sdc-taichi doctor``: what of the package works on this machine, and what is missing."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ _LIBRARIES = ("taichi", "numpy", "pandas", "pyarrow", "gymnasium", "pettingzoo",
 
 
 class Finding(NamedTuple):
-    """State of one thing that the package can use."""
+    """State of a thing that the package uses."""
 
     what: str
     """Name of the thing."""
     found: str
-    """State that it is in."""
+    """Its state."""
     advice: str = ""
-    """How to get what is missing; empty if nothing is."""
+    """How to install or mend it; empty if nothing is missing."""
     is_broken: bool = False
     """Whether the simulator cannot run in this state."""
 
@@ -58,10 +58,10 @@ class Finding(NamedTuple):
 def doctor_command(
     as_json: Annotated[bool, json_option("Print JSON.")] = False,
 ) -> None:
-    """Say what this machine has, what is missing, and how to get it.
+    """List what this machine has, what is missing, and how to install it.
 
-    Looks at versions, processor, folders, viewer and keys (whether they are set, not what they
-    are), and steps a small hall. Ends with exit code 1 if the simulator does not run.
+    Checks versions, processors, folders, the viewer and whether keys are set, and steps a small
+    hall. The exit code is 1 if the simulator does not run.
     """
     findings = [*_versions(), *_extras(), *_machine(), *_keys(), _first_step()]
     works = not any(each.is_broken for each in findings)

@@ -145,26 +145,28 @@ def evaluate_command(
                 stop=stop,
             )
         with prepared:
-            found = _evaluated(
+            evaluation = _evaluated(
                 prepared, folders, named, agents_alone=not no_agents, quiet=quiet, stop=stop
             )
             command = shlex.join(["sdc-taichi", *context.obj])
-            content = evaluation_content(found, prepared, command=command, folders=folders)
+            content = evaluation_content(evaluation, prepared, command=command, folders=folders)
             if as_json:
                 print(content_json(content), end="")
-            elif not quiet and len(found.rows):
-                _print_tables(found, prepared)
-            if out is not None and len(found.rows):
-                write_evaluation(out, found, prepared, content)
+            elif not quiet and len(evaluation.rows):
+                _print_tables(evaluation, prepared)
+            if out is not None and len(evaluation.rows):
+                write_evaluation(out, evaluation, prepared, content)
                 if not (quiet or as_json):
                     files = f"{EVALUATION_FILE}, {ROWS_FILE}, {TABLE_FILE}"
                     print(f"Files in {printable(out)}: {files}")
-    if found.missing:
-        left = ", ".join(found.missing)
+    if evaluation.missing:
+        left = ", ".join(evaluation.missing)
         print(f"interrupted; figures are whole, without {left}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED)
     if prepared.optimum is None and not no_optimum:
-        raise SdcError("evaluate: no optimum to tell shares of; valid without is --no-optimum")
+        raise SdcError(
+            "evaluate: no optimum, so no shares; valid without an optimum is --no-optimum"
+        )
 
 
 def _base_config(
@@ -187,7 +189,7 @@ def _prepared(
     """The weeks, without an optimum and with a note on stderr where it cannot be solved for.
 
     Raises:
-        typer.Exit: solving was stopped; what is kept has been printed.
+        typer.Exit: solving was stopped; a message says which results are stored.
     """
     from sdc_taichi.learning.evaluation import prepare
     from sdc_taichi.optimum import StoppedError
@@ -237,11 +239,11 @@ def _contenders(
     return contenders + [Contender(name, make_controller(name, fleet)) for name in named]
 
 
-def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
+def _print_tables(evaluation: Evaluation, weeks: DataCenterWeeks) -> None:
     """Print the tables of an evaluation."""
     from sdc_taichi.learning.evaluation_table import remarks, tables_of
 
-    for title, table in tables_of(found, weeks):
+    for title, table in tables_of(evaluation, weeks):
         print_table(title, table)
     for line in remarks(weeks):
         print(printable(line))

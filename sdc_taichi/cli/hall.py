@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -24,6 +21,7 @@ from sdc_taichi.cli.options import (
     json_option,
     out_option,
 )
+from sdc_taichi.cli.terminal import count_text
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
 from sdc_taichi.hall.air_metrics import rank
@@ -53,7 +51,10 @@ def show_hall(
     check_out_file(out, ".png", force=force)
     hall = solve_design_hall(config.read()[0])
     if out is not None:
-        _write_floor_plan(out, hall)
+        from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
+        from sdc_taichi.viz.plotting import save_picture
+
+        save_picture(floor_plan_figure(hall), out, parents=True)
     if as_json:
         typer.echo(json.dumps(design_hall_values(hall), indent=2))
         return
@@ -87,7 +88,9 @@ def solve_hall(
     center, _ = config.read()
     solution = solve_at_design_point(center, cell)
     if out is not None:
-        _write_matrix(out, solution)
+        provenance = np.array(json.dumps(solution.provenance, sort_keys=True))
+        with atomic_write(out, parents=True) as file:
+            np.savez(file, R=solution.R, provenance=provenance)
     if as_json:
         typer.echo(json.dumps(layout_solution_values(center, solution), indent=2))
         return
@@ -102,26 +105,15 @@ def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -
     Units are in the keys; lists per rack are in the order of the racks, row by row.
     """
     inner, outer = _row_means(config, solution.approach_k)
+    figures = {name: x for name, x in solution._asdict().items() if isinstance(x, int | float)}
     return {
-        "cells": solution.cells,
-        "seconds": round(solution.seconds, 3),
-        "supply_c": solution.supply_c,
-        "return_c": solution.return_c,
+        **figures,
         "approach_mean_k": float(solution.approach_k.mean()),
         "approach_outer_rows_k": outer,
         "approach_inner_rows_k": inner,
         "approach_k": solution.approach_k.tolist(),
         "supply_approach_k": config.hall.rack_approach_k().tolist(),
         "recirculated_share": solution.R.sum(axis=1).tolist(),
-        "shi": solution.shi,
-        "rhi": solution.rhi,
-        "rti_pct": solution.rti_pct,
-        "rci_hi_pct": solution.rci_hi_pct,
-        "rci_lo_pct": solution.rci_lo_pct,
-        "mass_residual": solution.mass_residual,
-        "share_residual": solution.share_residual,
-        "energy_residual": solution.energy_residual,
-        "direct_difference_k": solution.direct_difference_k,
         "provenance": solution.provenance,
     }
 
@@ -167,28 +159,8 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
     typer.echo("\n".join(lines))
 
 
-def _write_floor_plan(out: Path, hall: DesignHall) -> None:
-    from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
-    from sdc_taichi.viz.plotting import save_picture
-
-    save_picture(floor_plan_figure(hall), out, parents=True)
-
-
-def _write_matrix(out: Path, solution: LayoutSolution) -> None:
-    text = json.dumps(solution.provenance, sort_keys=True)
-    with atomic_write(out, parents=True) as file:
-        np.savez(file, R=solution.R, provenance=np.array(text))
-
-
 LISTED = 30
 """Most losses that the table on the screen lists."""
-
-
-class LostParts(StrEnum):
-    """Kinds of equipment that a failover study takes out of service."""
-
-    units = "units"
-    plant = "plant"
 
 
 @hall_app.command("failover")
@@ -196,8 +168,9 @@ def failover_command(
     *,
     config: ConfigOptions,
     of: Annotated[
-        LostParts, typer.Option("--of", help="Lose CRAC units, or devices of the plant.")
-    ] = LostParts.units,
+        Literal["units", "plant"],
+        typer.Option("--of", help="Lose CRAC units, or devices of the plant."),
+    ] = "units",
     out: Annotated[
         Path | None,
         out_option("Draw floor plan and curves, and write all losses beside it.", "FILE.png"),
@@ -214,13 +187,17 @@ def failover_command(
     check_out_file(out, ".png", force=force)
     table_path = None if out is None else out.with_suffix(".csv")
     check_out_file(table_path, ".csv", force=force)
-    study = study_failover(config.read()[0], of.value)
+    study = study_failover(config.read()[0], of)
     if out is not None and table_path is not None:
+        import pandas as pd
+
         from sdc_taichi.viz.floor_plan_figure import failover_figure
         from sdc_taichi.viz.plotting import save_picture
 
         save_picture(failover_figure(study), out, parents=True)
-        _write_rows(table_path, failover_rows(study, study.worst))
+        rows = pd.DataFrame(failover_rows(study, study.worst))
+        with atomic_write(table_path, parents=True) as file:
+            file.write(rows.to_csv(index=False, lineterminator="\r\n").encode())
     if as_json:
         typer.echo(json.dumps(failover_values(study), indent=2))
         return
@@ -247,9 +224,8 @@ def _print_study(study: Failover) -> None:
     order = [0, *(i for i in study.worst if i != 0)]
     for row in failover_rows(study, order[: LISTED + 1]):
         name, *numbers, off = row.values()
-        table.add_row(
-            name, *(_minutes(x) for x in numbers[:2]), *(f"{x:.1f}" for x in numbers[2:]), f"{off}"
-        )
+        minutes = ("-" if x is None else f"{x:.0f}" for x in numbers[:2])
+        table.add_row(name, *minutes, *(f"{x:.1f}" for x in numbers[2:]), f"{off}")
     Console().print(table)
     if len(order) > LISTED + 1:
         typer.echo(f"The worst {LISTED} of {len(order) - 1} losses.")
@@ -261,44 +237,33 @@ def _print_study(study: Failover) -> None:
     )
 
 
-def _minutes(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"
-
-
-def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_write(path, parents=True) as file:
-        file.write(text.getvalue().encode())
-
-
 LISTED_ROWS = 12
 """Number of rows up to which all are listed; of larger halls the hottest rows are."""
 LISTED_UNITS = 8
 """Number of CRAC units up to which each has a line of its own."""
 
 
-def describe_hall(found: DesignHall) -> str:
+def describe_hall(design: DesignHall) -> str:
     """Room, CRAC units, air and rows of a hall at its design point, as lines of text."""
-    return "\n".join([*_room_lines(found), *_unit_lines(found), *_air_lines(found), *_rows(found)])
+    return "\n".join(
+        [*_room_lines(design), *_unit_lines(design), *_air_lines(design), *_rows(design)]
+    )
 
 
-def _room_lines(found: DesignHall) -> list[str]:
-    hall, plan = found.config.hall, found.plan
+def _room_lines(design: DesignHall) -> list[str]:
+    hall, plan = design.config.hall, design.plan
     size = hall.layout
     grilles = "in the end walls" if size.returns == "end_wall" else "above the hot aisles"
     cold, hot = hall.rows // 2, (hall.rows - 1) // 2
     return [
-        f"{printable(found.config.name)}: {_count(hall.rows, 'row')} of "
-        f"{_count(hall.racks_per_row, 'rack')}, {found.servers:,} servers, "
+        f"{printable(design.config.name)}: {count_text(hall.rows, 'row')} of "
+        f"{count_text(hall.racks_per_row, 'rack')}, {design.servers:,} servers, "
         f"inlet model {hall.inlet_model}",
         f"room          {plan.length_m:.4g} x {plan.width_m:.4g} x {size.ceiling_m:.4g} m, "
         f"{plan.air_m3:,.4g} m3 of air",
         f"racks         {size.rack_pitch_m:g} m wide, {size.rack_depth_m:g} m deep, "
         f"{size.rack_height_m:g} m high",
-        *_type_lines(found),
+        *_type_lines(design),
         f"aisles        {cold} cold of {size.cold_aisle_m:g} m and {hot} hot of "
         f"{size.hot_aisle_m:g} m between rows; {size.side_margin_m:g} m beside the outer rows, "
         f"{size.end_margin_m:g} m at the row ends",
@@ -306,30 +271,30 @@ def _room_lines(found: DesignHall) -> list[str]:
     ]
 
 
-def _type_lines(found: DesignHall) -> list[str]:
+def _type_lines(design: DesignHall) -> list[str]:
     """A line for each type of racks: how many, and what one of them draws at the design point."""
-    hall = found.config.hall
+    hall = design.config.hall
     named = np.array(hall.rack_type_names())
-    rise_k = found.outlet_c - found.inlet_c
+    rise_k = design.outlet_c - design.inlet_c
     lines = []
     for name in hall.rack_types:
         of_type = named == name
         if not of_type.any():
             lines.append(f"  type {printable(name)}: no racks")
             continue
-        groups = found.config.rack_groups()[int(np.argmax(of_type))]
+        groups = design.config.rack_groups()[int(np.argmax(of_type))]
         servers = " + ".join(f"{g.count:,} x {g.full_w:,.6g} W" for g in groups)
         lines.append(
-            f"  type {printable(name)}: {_count(int(of_type.sum()), 'rack')} of {servers}, "
-            f"{_span(found.it_w[of_type] / 1e3, 1)} kW, "
-            f"{_span(found.airflow_m3s[of_type], 3)} m3/s, "
+            f"  type {printable(name)}: {count_text(int(of_type.sum()), 'rack')} of {servers}, "
+            f"{_span(design.it_w[of_type] / 1e3, 1)} kW, "
+            f"{_span(design.airflow_m3s[of_type], 3)} m3/s, "
             f"{_span(rise_k[of_type], 1)} K of rise"
         )
     return lines
 
 
-def _unit_lines(found: DesignHall) -> list[str]:
-    flow = found.unit_m3s
+def _unit_lines(design: DesignHall) -> list[str]:
+    flow = design.unit_m3s
     count = len(flow)
     head = f"CRAC units    {count}, {flow.sum():,.4g} m3/s at full speed"
     if count > LISTED_UNITS:
@@ -338,23 +303,24 @@ def _unit_lines(found: DesignHall) -> list[str]:
         head,
         *(
             f"  unit {i}      at x {x:.4g}, y {y:.4g} m: {flow[i]:.4g} m3/s"
-            for i, (x, y) in enumerate(found.unit_places_m)
+            for i, (x, y) in enumerate(design.unit_places_m)
         ),
     ]
 
 
-def _air_lines(found: DesignHall) -> list[str]:
-    inlet, air = found.inlet_c, found.air
-    row, place = divmod(found.hottest_rack, found.config.hall.racks_per_row)
+def _air_lines(design: DesignHall) -> list[str]:
+    inlet, air = design.inlet_c, design.air
+    row, place = divmod(design.hottest_rack, design.config.hall.racks_per_row)
     lines = [
-        f"design point  full load, supply air {found.supply_c:g} C",
-        f"IT power      {found.it_w.sum() / 1e3:,.1f} kW, per rack {_span(found.it_w / 1e3, 1)} kW",
-        f"airflow       {found.airflow_m3s.sum():,.4g} m3/s through the servers, per rack "
-        f"{_span(found.airflow_m3s, 3)} m3/s",
+        f"design point  full load, supply air {design.supply_c:g} C",
+        f"IT power      {design.it_w.sum() / 1e3:,.1f} kW, per rack "
+        f"{_span(design.it_w / 1e3, 1)} kW",
+        f"airflow       {design.airflow_m3s.sum():,.4g} m3/s through the servers, per rack "
+        f"{_span(design.airflow_m3s, 3)} m3/s",
         f"rack inlets   {inlet.min():.2f}..{inlet.max():.2f} C, mean {inlet.mean():.2f} C; "
-        f"over supply {_span(found.approach_k, 2)} K",
-        f"hottest       {found.inlet_max_c.max():.2f} C: server {found.hottest_server} of rack "
-        f"{found.hottest_rack} (row {row}, place {place}, servers counted from the floor)",
+        f"over supply {_span(design.approach_k, 2)} K",
+        f"hottest       {design.inlet_max_c.max():.2f} C: server {design.hottest_server} of rack "
+        f"{design.hottest_rack} (row {row}, place {place}, servers counted from the floor)",
     ]
     if air is None:
         return lines
@@ -366,27 +332,27 @@ def _air_lines(found: DesignHall) -> list[str]:
         f"exhaust share {100 * share.mean():.2f} % of the racks' intake (r), per rack "
         f"{_span(100 * share, 2)} %; spectral radius of R {known}{high:.4f}",
         f"bypass        {100 * air.bypass_share:.2f} % of the CRAC air",
-        f"return air    {air.return_c:.2f} C, {air.return_c - found.outlet_c.mean():+z.2f} K from "
+        f"return air    {air.return_c:.2f} C, {air.return_c - design.outlet_c.mean():+z.2f} K from "
         "the mean outlet",
         f"indices       SHI {air.shi:.3f}, RHI {1 - air.shi:.3f}, RTI {air.rti_pct:.1f} %",
     ]
 
 
-def _rows(found: DesignHall) -> list[str]:
-    hall = found.config.hall
+def _rows(design: DesignHall) -> list[str]:
+    hall = design.config.hall
 
     def per_row(values: F64) -> F64:
         return values.reshape(hall.rows, hall.racks_per_row)
 
-    hottest = per_row(found.inlet_max_c).max(axis=1)
+    hottest = per_row(design.inlet_max_c).max(axis=1)
     listed = np.arange(hall.rows)
     note = []
     if hall.rows > LISTED_ROWS:
         order = np.argsort(-rank(hottest), kind="stable")
         listed = np.sort(order[:LISTED_ROWS])
         note = [f"({LISTED_ROWS} hottest of {hall.rows:,} rows)"]
-    approach, inlet = per_row(found.approach_k), per_row(found.inlet_c)
-    power, airflow = per_row(found.it_w) / 1e3, per_row(found.airflow_m3s)
+    approach, inlet = per_row(design.approach_k), per_row(design.inlet_c)
+    power, airflow = per_row(design.it_w) / 1e3, per_row(design.airflow_m3s)
     lines = [
         "",
         f"{'row':>5} {'faces':>6} {'IT':>9} {'airflow':>9} {'approach':>9} "
@@ -407,7 +373,3 @@ def _rows(found: DesignHall) -> list[str]:
 def _span(values: F64, digits: int) -> str:
     low, high = f"{values.min():.{digits}f}", f"{values.max():.{digits}f}"
     return low if low == high else f"{low}..{high}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}" + ("s" if number != 1 else "")

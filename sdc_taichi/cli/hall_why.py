@@ -131,12 +131,12 @@ def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int
     wanted = hottest_step if step is None else step
     if not (isinstance(wanted, int) and is_number(metrics.get("hottest_inlet_c"))):
         raise SdcError(f"{folder}: no hottest inlet of {name}; simulate the run again")
-    found = hottest_inlets(run, index) if wanted == hottest_step else None
-    if found is None:
-        found = inlets_at_step(run, index, wanted)
-    at = "at the end of its hottest step" if found.step == hottest_step else "at the end of step"
-    at = f"{at} {found.step} of {folder}, whose hottest inlet is {found.hottest_c:.2f} C"
-    return name, found.config, at, found.inlets
+    air = hottest_inlets(run, index) if wanted == hottest_step else None
+    if air is None:
+        air = inlets_at_step(run, index, wanted)
+    at = "at the end of its hottest step" if air.step == hottest_step else "at the end of step"
+    at = f"{at} {air.step} of {folder}, whose hottest inlet is {air.hottest_c:.2f} C"
+    return name, air.config, at, air.inlets
 
 
 def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -17,11 +16,11 @@ import typer.core
 from sdc_taichi.cli.terminal import (
     EXIT_FAILURE,
     EXIT_INTERRUPTED,
-    SECONDS_BETWEEN_LINES,
+    ProgressLines,
     duration,
     interruptible,
     print_notes,
-    rich_progress,
+    stage_bars,
 )
 from sdc_taichi.errors import SdcError, printable
 
@@ -48,17 +47,17 @@ def with_ray_address(args: list[str]) -> list[str]:
         args: arguments of a command line.
     """
     end = args.index("--") if "--" in args else len(args)
-    found = []
+    words: list[str] = []
     for i, (word, after) in enumerate(zip_longest(args, args[1:], fillvalue="")):
-        found.append(word)
+        words.append(word)
         if word == "--ray" and i < end and not _ADDRESS.fullmatch(after):
-            found.append("local")
-    return found
+            words.append("local")
+    return words
 
 
 @dataclass(frozen=True)
 class JobOptions:
-    """Where jobs run, and whether those of a study that was cut off are left out.
+    """Where jobs run, and whether an interrupted study is resumed.
 
     A command with these options is a ``JobsCommand``.
     """
@@ -84,7 +83,7 @@ class JobOptions:
     ] = None
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on with the study in --out: run what is missing."),
+        typer.Option("--resume", help="Resume the study in --out: run what is missing."),
     ] = False
 
     def executor(self) -> Executor:
@@ -103,10 +102,10 @@ class JobOptions:
 
 
 class JobSession:
-    """A study under way: its jobs run in stages, with progress on stderr.
+    """A running study: its jobs run in stages, with progress on stderr.
 
     Args:
-        store: where results are kept; the folder is claimed.
+        store: folder of the results, which is claimed.
         executor: what runs the jobs.
         stop: says whether the user has interrupted the command.
         shown: whether progress is shown.
@@ -142,7 +141,9 @@ class JobSession:
                     jobs, self.store, self._executor, inputs, stop=self._stop, on_done=on_done
                 )
             except SdcError as error:
-                raise SdcError(f"{error}; what is done is kept, go on with --resume") from error
+                raise SdcError(
+                    f"{error}; finished jobs are stored, continue with --resume"
+                ) from error
         self.summaries.append(done)
         return done
 
@@ -172,16 +173,16 @@ class JobSession:
 def job_session(
     store: ResultStore, study: Study, options: JobOptions, *, quiet: bool = False
 ) -> Iterator[JobSession]:
-    """Begin a study, or go on with it, and end its workers and its claim on the folder.
+    """Begin or resume a study, and at the end release its workers and its folder.
 
     Args:
         store: folder of the study.
         study: what is to be done.
-        options: where the jobs run, and whether the study in the folder goes on.
+        options: where the jobs run, and whether the study in the folder is resumed.
         quiet: whether to show neither progress nor notes.
 
     Yields:
-        The study under way, whose jobs end at Ctrl-C.
+        The running study, whose jobs end at Ctrl-C.
 
     Raises:
         SdcError: the folder is not free, or options are not valid.
@@ -199,63 +200,33 @@ def job_progress(
 ) -> Iterator[Callable[[Job, DoneJob | None], None]]:
     """Show on stderr how many jobs have ended: a bar in a terminal, lines elsewhere.
 
-    Jobs that fail are a line each in any case.
+    A job that fails has a line in any case.
 
     Args:
         stage: name of what the jobs do.
         total: number of jobs.
-        shown: whether to show more than what fails.
+        shown: whether to show more than the jobs that fail.
 
     Yields:
-        A function to call with each job and how it ended; None where its result was kept.
+        A function to call with each job and how it ended; None if its result was stored before.
     """
-    if shown and sys.stderr.isatty():
-        with rich_progress() as progress:
-            task = progress.add_task(stage, total=total)
+    lines, has_lines = ProgressLines(), shown and not sys.stderr.isatty()
+    ended = kept = 0
+    with stage_bars(shown=shown) as progress:
 
-            def advance(job: Job, ended: DoneJob | None) -> None:
-                if ended is not None and ended.error:
-                    text = _failure(job, ended)
-                    progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
-                progress.advance(task)
+        def on_done(job: Job, done: DoneJob | None) -> None:
+            nonlocal ended, kept
+            ended, kept = ended + 1, kept + (done is None)
+            if done is not None and done.error:
+                text = f"failed: {printable(job.name)}: {done.error}"
+                print(text, file=sys.stderr, flush=True)
+            progress(stage, ended, total)
+            is_last = ended == total
+            if has_lines and (is_last or done is not None):
+                state = (
+                    "kept" if done is None else "failed" if done.error else duration(done.core_s)
+                )
+                count = f"{stage} {ended:,}/{total:,}" + (f", {kept:,} kept" if kept else "")
+                lines.print(f"{count}: {printable(job.name)} {state}", always=is_last)
 
-            yield advance
-    else:
-        yield _Lines(stage, total, shown=shown).tell
-
-
-class _Lines:
-    """Progress in lines, not too many of them."""
-
-    def __init__(self, stage: str, total: int, *, shown: bool) -> None:
-        self._stage, self._total, self._shown = stage, total, shown
-        self._ended = self._kept = 0
-        self._told_s = -SECONDS_BETWEEN_LINES
-
-    def tell(self, job: Job, ended: DoneJob | None) -> None:
-        """Count a job, and tell of it if there is something to tell."""
-        self._ended += 1
-        self._kept += ended is None
-        is_last = self._ended == self._total
-        if ended is not None and ended.error:
-            print(_failure(job, ended), file=sys.stderr, flush=True)
-        if not self._shown:
-            return
-        if is_last or (ended and time.monotonic() - self._told_s >= SECONDS_BETWEEN_LINES):
-            self._told_s = time.monotonic()
-            kept = f", {self._kept:,} kept" if self._kept else ""
-            place = f"{self._stage} {self._ended:,}/{self._total:,}{kept}"
-            line = f"{place}: {printable(job.name)} {_how(ended)}"
-            print(line, file=sys.stderr, flush=True)
-
-
-def _failure(job: Job, ended: DoneJob) -> str:
-    """A job that failed, in one line."""
-    return f"failed: {printable(job.name)}: {ended.error}"
-
-
-def _how(ended: DoneJob | None) -> str:
-    """How a job ended: in what processor time, or why in none."""
-    if ended is None:
-        return "kept"
-    return "failed" if ended.error else duration(ended.core_s)
+        yield on_done

@@ -1,4 +1,4 @@
-"""``sdc-taichi optimum``: a bound on what controllers can reach, and what has been reached."""
+"""``sdc-taichi optimum``: a bound for all controllers, and a figure that has been reached."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ from sdc_taichi.cli.options import (
 )
 from sdc_taichi.cli.terminal import (
     EXIT_INTERRUPTED,
+    count_text,
     exit_if_stopped,
     figures_table,
+    first_lines,
     interruptible,
     print_notes,
     progress_bar,
@@ -75,7 +77,10 @@ def optimum_command(
     max_inlet: Annotated[
         float | None,
         typer.Option(
-            metavar="C", help="Hottest inlet to allow. [default: of protection.ashrae_class]"
+            min=10.0,
+            max=60.0,
+            metavar="C",
+            help="Hottest inlet to allow. [default: of protection.ashrae_class]",
         ),
     ] = None,
     run: ForecastRunOptions,
@@ -87,10 +92,10 @@ def optimum_command(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
     as_json: Annotated[bool, json_option("Print optimum.json instead of the table.")] = False,
 ) -> None:
-    """Find out how low carbon, energy, cost or water of data centers can come.
+    """Find the least carbon, energy, cost or water that data centers can reach.
 
-    Prints a bound that no controller comes below, a figure that the simulator has reached, and
-    where named controllers stand between idle commands and that. All inputs are known in advance.
+    Prints a lower bound for all controllers, a figure that the simulator has reached, and where
+    named controllers are between idle commands and that figure. All inputs are known in advance.
     """
     from sdc_taichi.control import make_controller
     from sdc_taichi.optimum.objective import Objective
@@ -104,7 +109,6 @@ def optimum_command(
     fleet = build_fleet(sites.data_centers(config.read()[0], start=start))
     steps = whole_steps(days, fleet.steps_per_hour, "--days")
     scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
-    limit_c = _inlet_limit(max_inlet)
     require_events_start_before(24.0 * days, fleet.configs)
     fleet.require_distinct_names()
     error = run.error()
@@ -115,29 +119,29 @@ def optimum_command(
         prepare_folder(out, force=force)
     with Simulator(fleet, precision=run.precision) as sim, interruptible() as interrupted:
         print_notes(sim.drivers.notes)
-        found = solve_beside(
+        optimum = solve_beside(
             sim,
             aim,
             steps,
             seed=run.seed,
             agents=movable,
             scored_from=scored_from,
-            inlet_limit_c=limit_c,
+            inlet_limit_c=max_inlet,
             cache=not no_cache,
             quiet=quiet,
             stop=interrupted,
         )
-        reached = _run_controllers(sim, found, named, run.seed, error, quiet, interrupted)
+        reached = _run_controllers(sim, optimum, named, run.seed, error, quiet, interrupted)
         if as_json:
-            print(metrics_json(optimum_content(found, reached)))
+            print(metrics_json(optimum_content(optimum, reached)))
         elif not quiet:
-            _print_optimum(optimum_content(found, reached), fleet.steps_per_hour)
+            _print_optimum(optimum_content(optimum, reached), fleet.steps_per_hour)
         is_written = False
         if out is not None and not interrupted():
             with progress_bar(steps, shown=not quiet) as advance:
                 is_written = write_optimum(
                     sim,
-                    found,
+                    optimum,
                     out,
                     reached=reached,
                     seed=run.seed,
@@ -181,7 +185,7 @@ def solve_beside(
         stop: asked now and then; true ends the work.
 
     Raises:
-        typer.Exit: it was stopped; what is kept has been printed.
+        typer.Exit: it was stopped; a message says which results are stored.
         SdcError: there is no optimum of these.
     """
     from sdc_taichi.optimum import solve
@@ -219,7 +223,7 @@ def _run_controllers(
     reached = []
     for name, controller in named.items():
         with progress_bar(optimum.steps, shown=not quiet) as advance:
-            found = run_beside(
+            achievement = run_beside(
                 optimum,
                 sim,
                 controller,
@@ -229,13 +233,13 @@ def _run_controllers(
                 on_step=advance,
                 stop=stop,
             )
-        if found is not None:
-            reached.append(found)
+        if achievement is not None:
+            reached.append(achievement)
     return reached
 
 
 def _print_interruption(missing: list[str], out: Path | None) -> None:
-    """Say on stderr what an interrupted command did not do; what it printed is whole."""
+    """Say on stderr what an interrupted command did not do; the printed figures are complete."""
     left = [f"controllers {', '.join(missing)}"] if missing else []
     left += [f"files in {printable(out)}"] if out is not None else []
     text = f"; without {' and '.join(left)}" if left else ""
@@ -272,17 +276,10 @@ def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:
     """Number of steps of ``--warm-up``."""
     if days == 0.0:
         return 0
-    found = whole_steps(days, steps_per_hour, "--warm-up")
-    if found >= steps:
+    count = whole_steps(days, steps_per_hour, "--warm-up")
+    if count >= steps:
         raise ConfigError(f"--warm-up {days:g}: valid is less than --days")
-    return found
-
-
-def _inlet_limit(limit_c: float | None) -> float | None:
-    """Limit of ``--max-inlet``."""
-    if limit_c is not None and not 10.0 <= limit_c <= 60.0:
-        raise ConfigError(f"--max-inlet {limit_c:g}: valid is 10..60 C")
-    return limit_c
+    return count
 
 
 def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
@@ -297,59 +294,41 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
     console = wide_console(200)
     dcs, scored = content["data_centers"], content["steps"] - content["scored_from"]
     days = scored / steps_per_hour / 24
-    count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"
     warm_up = content["scored_from"] / steps_per_hour / 24
-    after = f" after a warm-up of {_days(warm_up)}" if warm_up else ""
-    console.print(f"Optimum of {content['objective']}: {count}, {_days(days)}{after}")
-    names = [dc["name"] for dc in dcs]
-    columns, total = _columns(content), _total(content)
-    console.print(figures_table(console, _titles(content), names, columns, total, "z.2f"))
-    remarks = optimum_remarks(content)
-    for line in remarks[:MOST_LINES]:
-        console.print(line)
-    if len(remarks) > MOST_LINES:
-        console.print(f"and {len(remarks) - MOST_LINES} more, see --json")
-
-
-def _titles(content: Mapping[str, Any]) -> list[str]:
-    """Titles of the rows."""
-    return [
+    after = f" after a warm-up of {count_text(warm_up, 'day')}" if warm_up else ""
+    count = f"{count_text(len(dcs), 'data center')}, {count_text(days, 'day')}"
+    console.print(f"Optimum of {content['objective']}: {count}{after}")
+    names, controllers = [dc["name"] for dc in dcs], content["controllers"]
+    titles = [
         f"idle ({content['unit']})",
         "bound (% against idle)",
         "achieved (% against idle)",
         "gap (points)",
         *(f"{name} alone (%)" for name in content["total"]["alone"]),
-        *(f"{each['controller']} (% of the achievable)" for each in content["controllers"]),
+        *(f"{each['controller']} (% of the achievable)" for each in controllers),
     ]
+    columns = [
+        _values(dc, [each["data_centers"][i]["share"] for each in controllers])
+        for i, dc in enumerate(dcs)
+    ]
+    total = _values(content["total"], [each["share"] for each in controllers])
+    console.print(figures_table(console, titles, names, columns, total, "z.2f"))
+    for line in first_lines(optimum_remarks(content), MOST_LINES, ", see --json"):
+        console.print(line)
 
 
 def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[float | None]:
     """Values of the rows of a data center, or of all."""
     idle = figures["idle"]
 
-    def change(value: float | None) -> float | None:
+    def change_pct(value: float | None) -> float | None:
         return None if value is None or not idle else 100.0 * (value / idle - 1.0)
 
-    alone = [change(value) for value in figures["alone"].values()]
-    own = [None if share is None else 100.0 * share for share in shares]
-    both = change(figures["bound"]), change(figures["achieved"])
-    return [idle, *both, figures["gap_points"], *alone, *own]
-
-
-def _columns(content: Mapping[str, Any]) -> list[list[float | None]]:
-    """Values of the rows of each data center."""
-    shares = [each["data_centers"] for each in content["controllers"]]
     return [
-        _values(dc, [own[i]["share"] for own in shares])
-        for i, dc in enumerate(content["data_centers"])
+        idle,
+        change_pct(figures["bound"]),
+        change_pct(figures["achieved"]),
+        figures["gap_points"],
+        *(change_pct(value) for value in figures["alone"].values()),
+        *(None if share is None else 100.0 * share for share in shares),
     ]
-
-
-def _total(content: Mapping[str, Any]) -> list[float | None]:
-    """Values of the rows of all data centers together."""
-    return _values(content["total"], [each["share"] for each in content["controllers"]])
-
-
-def _days(count: float) -> str:
-    """A number of days."""
-    return f"{count:g} day" + ("" if count == 1 else "s")

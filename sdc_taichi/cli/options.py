@@ -1,4 +1,4 @@
-"""Options that several commands share, groups of them, and what they stand for.
+"""Options that several commands share, groups of options, and their values.
 
 A group of options is a dataclass whose fields are options. A command names the group as the type
 of a parameter, and ``CommandApp`` gives it one option for each field.
@@ -52,7 +52,7 @@ class CommandApp(typer.Typer):
 
 
 def _flattened(function: Callable[..., None]) -> Callable[..., None]:
-    """The function of a command with an option in the place of each field of its groups."""
+    """The function of a command, its groups replaced by an option for each field."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
@@ -95,13 +95,10 @@ def _parameters_of(group: type[Any]) -> list[inspect.Parameter]:
     ]
 
 
-# --- Words that shells complete -------------------------------------------------------------------
-
-
 def completed_by(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Completion of a word of the command line: the names that begin like it.
+    """Completion of a word of the command line: names that begin with it.
 
-    Where no name does, shells offer files.
+    If there are none, shells offer files.
     """
 
     def complete(incomplete: str) -> list[str]:
@@ -117,14 +114,14 @@ def _presets_and_fields() -> list[str]:
 
 
 def _controllers() -> Iterable[str]:
-    """Names of controllers; of those that take a value, the part up to the colon."""
+    """Names of controllers; for those with a value, the part up to the colon."""
     from sdc_taichi.control.registry import controller_names
 
     return ("".join(name.partition(":")[:2]) for name in controller_names())
 
 
 def complete_sites(incomplete: str) -> list[str]:
-    """Completion of the last of several sites that are separated by commas."""
+    """Completion of the last site in a list separated by commas."""
     from sdc_taichi.exogenous.registry import site_names
 
     before, comma, _ = incomplete.rpartition(",")
@@ -134,8 +131,6 @@ def complete_sites(incomplete: str) -> list[str]:
 
 
 complete_controllers = completed_by(_controllers)
-
-# --- Single options -------------------------------------------------------------------------------
 
 Source = Annotated[
     list[str] | None,
@@ -161,23 +156,23 @@ Site = Annotated[
 ]
 Days = Annotated[float, typer.Option(help="Length, in days; may exceed a year.")]
 Start = Annotated[str | None, typer.Option(metavar="MM-DD", help="First day, local standard time.")]
+
+
+def controllers_option(help: str) -> Any:
+    """Option ``--controller`` of a command, which may be repeated or not."""
+    return typer.Option(metavar="NAME", help=help, autocompletion=complete_controllers)
+
+
 Compared = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME",
-        help="Controller to compare, as of simulate; repeatable.",
-        autocompletion=complete_controllers,
-    ),
+    list[str] | None, controllers_option("Controller to compare, as of simulate; repeatable.")
 ]
 """Option of a command that compares controllers with an optimum."""
-NoCache = Annotated[
-    bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
-]
+NoCache = Annotated[bool, typer.Option("--no-cache", help="Solve again, and store nothing.")]
 """Option of a command that solves for an optimum."""
 FolderForce = Annotated[bool, typer.Option("--force", help="Write into a folder with other files.")]
 """Option of a command that writes a folder."""
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
-"""Option of a command that prints a summary of what it has done."""
+"""Option of a command that prints a summary."""
 
 
 def out_option(help: str, metavar: str | None = None) -> Any:
@@ -195,12 +190,9 @@ def json_option(help: str) -> Any:
     return typer.Option("--json", help=help)
 
 
-# --- Groups of options ----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ConfigOptions:
-    """The configuration that a command begins with."""
+    """The configuration of a command."""
 
     source: Source = None
     overrides: Overrides = None
@@ -244,7 +236,7 @@ class SiteOptions:
         """Configurations of the data centers at the sites.
 
         Args:
-            base: configuration that they all begin with.
+            base: configuration that all of them are made from.
             start: first day, of ``--start``.
             dcs: number of ``--dcs``; None is one per site.
             sample: file of ``--sample``.
@@ -336,9 +328,6 @@ class ForecastRunOptions(RunOptions):
         return PERFECT if self.forecast_error is None else ForecastError.parse(self.forecast_error)
 
 
-# --- What options stand for -----------------------------------------------------------------------
-
-
 def check_out_file(out: Path | None, suffix: str, *, force: bool, option: str = "--out") -> None:
     """Check the file of an option such as ``--out`` before any work; None is no file.
 
@@ -367,26 +356,26 @@ def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:
     Raises:
         ConfigError: two presets or files.
     """
-    given = source or []
-    files = [text for text in given if "=" not in text or os.path.isfile(text)]
+    words = source or []
+    files = [text for text in words if "=" not in text or os.path.isfile(text)]
     if len(files) > 1:
         raise ConfigError(
             f"{files[1]!r}: a second preset or file after {files[0]!r}; valid is one, and "
             "overrides section.key=value"
         )
-    return next(iter(files), None), [text for text in given if text not in files]
+    return next(iter(files), None), [text for text in words if text not in files]
 
 
 def read_config(
     source: list[str] | None, overrides: list[str] | None = None
 ) -> tuple[DataCenterConfig, str]:
-    """The config that ``Source`` and ``Overrides`` give, and the name of its preset or file.
+    """The configuration of ``Source`` and ``Overrides``, and the name of its preset or file.
 
     Raises:
         ConfigError: two presets or files, or a config that is not valid.
     """
-    found, assigned = parse_source(source)
-    name = "corrected" if found is None else found
+    preset, assigned = parse_source(source)
+    name = preset or "corrected"
     return load_config(name, [*(overrides or []), *assigned]), name
 
 
@@ -424,9 +413,9 @@ def _read_sample(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid YAML ({error})") from None
     wrong = [name for name in rules if not isinstance(name, str)] if isinstance(rules, dict) else []
     if not isinstance(rules, dict) or wrong:
-        found = f"key {wrong[0]!r}" if wrong else f"the top level is a {type(rules).__name__}"
+        fault = f"key {wrong[0]!r}" if wrong else f"the top level is a {type(rules).__name__}"
         raise ConfigError(
-            f"{path}: {found}; valid is a mapping of fields, such as hvac.chiller.reference_cop, "
+            f"{path}: {fault}; valid is a mapping of fields, such as hvac.chiller.reference_cop, "
             "to {uniform: [low, high]} or {choice: [a, b]}"
         )
     return rules

@@ -21,7 +21,7 @@ from sdc_taichi.cli.options import (
     Quiet,
     SiteOptions,
     Start,
-    complete_controllers,
+    controllers_option,
     json_option,
     out_option,
 )
@@ -118,12 +118,10 @@ def simulate_command(
     ] = None,
     controller: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
+        controllers_option(
+            "idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
             "greedy-ci, mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
-            "load=greedy-ci,cooling=g36,battery=policy:runs/happo.",
-            autocompletion=complete_controllers,
+            "load=greedy-ci,cooling=g36,battery=policy:runs/happo."
         ),
     ] = "idle",
     run: ForecastRunOptions,
@@ -132,7 +130,7 @@ def simulate_command(
         typer.Option(
             metavar="TERMS",
             help="Also solve for the optimum of carbon, energy, cost, water or a sum such as "
-            "carbon+0.002*water, and tell the run's share of the achievable.",
+            "carbon+0.002*water, and print the run's share of the achievable.",
         ),
     ] = None,
     out: Annotated[
@@ -231,12 +229,12 @@ def _default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
 def _recorded(
     recorder: Recorder | None, sim: Simulator, request: RunRequest
 ) -> Iterator[Callable[[StepResult], None]]:
-    """Keep a recording open while a run lasts, if there is a recorder.
+    """Record a run, if there is a recorder.
 
     Args:
-        recorder: what records; None records nothing.
+        recorder: the recorder; None records nothing.
         sim: the simulator, before its first step.
-        request: what it is to do.
+        request: the run.
 
     Yields:
         A function to call with the result of every step.
@@ -255,19 +253,19 @@ def _recorded(
 
 
 def _print_recording(recorder: Recorder | None) -> None:
-    """Print where the recording of a run is, if it is a file."""
+    """Print the file of the recording of a run, if there is one."""
     if recorder is not None and recorder.file is not None and not recorder.failed:
         file = printable(recorder.file)
         print(f"Recording: {file} (open with: sdc-taichi view {file})")
 
 
 def _serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
-    """Keep a run that is done on show until Ctrl-C, if it is served to viewers."""
+    """Serve a finished run to viewers until Ctrl-C, if it is served at all."""
     if recorder is None or recorder.served_address is None or recorder.failed:
         return
     recorder.flush()
     if not interrupted():
-        text = f"the run is done and still served at {recorder.served_address}; Ctrl-C ends it"
+        text = f"the run is finished and still served at {recorder.served_address}; Ctrl-C ends it"
         print(text, file=sys.stderr)
     while not interrupted():
         time.sleep(0.1)

@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sdc_taichi.cli.terminal import figure_text, figures_table, wide_console
+from sdc_taichi.cli.terminal import (
+    count_text,
+    figure_text,
+    figures_table,
+    first_lines,
+    wide_console,
+)
 
 NUMBER_FORMAT = "z.4g"
 """Format of figures below 1000."""
@@ -57,10 +63,10 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     console = wide_console(200)
     dcs, steps = metrics["data_centers"], metrics["steps_done"]
     days = steps / steps_per_hour / 24
-    count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"
     console.print(
-        f"{label}: {count}, {days:g} days from {dcs[0]['start']} ({steps} steps of "
-        f"{60 // steps_per_hour} min), controller {metrics['controller']}"
+        f"{label}: {count_text(len(dcs), 'data center')}, {days:g} days from "
+        f"{dcs[0]['start']} ({steps} steps of {60 // steps_per_hour} min), "
+        f"controller {metrics['controller']}"
     )
     titles, keys = zip(*_ROWS, strict=True)
     columns = [[dc["metrics"][key] for key in keys] for dc in dcs]
@@ -78,10 +84,8 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     sources = dict.fromkeys(
         f"{kind}: {source}" for dc in dcs for kind, source in dc["provenance"].items()
     )
-    for line in sorted(sources)[:MOST_LINES]:
+    for line in first_lines(sorted(sources), MOST_LINES, ", see metrics.json"):
         console.print(f"  {line}")
-    if len(sources) > MOST_LINES:
-        console.print(f"  and {len(sources) - MOST_LINES} more, see metrics.json")
     config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
     more = ", optimum/" if "optimum" in metrics else ""
     console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}{more}")
@@ -105,14 +109,10 @@ def _optimum_lines(metrics: dict[str, Any]) -> list[str]:
     idle, bound, achieved = (figure_text(total[name], NUMBER_FORMAT) for name in names)
     share = total["achievable_share"]
     reached = "-" if share is None else f"{100 * share:z.1f} %"
-    remarks = remarks_beside(metrics)
-    shown = remarks[:MOST_LINES]
-    if len(remarks) > MOST_LINES:
-        shown.append(f"and {len(remarks) - MOST_LINES} more, see metrics.json")
     return [
         f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
         f" bound {bound} {of['unit']}; work and energy left at the end are valued",
-        *shown,
+        *first_lines(remarks_beside(metrics), MOST_LINES, ", see metrics.json"),
     ]
 
 
@@ -127,6 +127,4 @@ def _event_lines(metrics: dict[str, Any]) -> list[str]:
                 f"Event: {dc['name']}: {event['kind']}{target}{amount}, steps "
                 f"{event['start_step']}..{event['end_step'] - 1}"
             )
-    if len(lines) > EVENT_LINES:
-        lines[EVENT_LINES:] = [f"and {len(lines) - EVENT_LINES} more events, see metrics.json"]
-    return lines
+    return first_lines(lines, EVENT_LINES, " events, see metrics.json")

@@ -15,11 +15,11 @@ from sdc_taichi.cli.options import (
     ForecastRunOptions,
     Quiet,
     Site,
-    complete_controllers,
+    controllers_option,
     out_option,
     site_names,
 )
-from sdc_taichi.cli.terminal import EXIT_FAILURE, print_notes, print_table
+from sdc_taichi.cli.terminal import EXIT_FAILURE, first_lines, print_notes, print_table
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
 if TYPE_CHECKING:
@@ -56,11 +56,7 @@ def sweep_command(
     ] = None,
     controller: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Controller, as of simulate; repeatable. [default: idle]",
-            autocompletion=complete_controllers,
-        ),
+        controllers_option("Controller, as of simulate; repeatable. [default: idle]"),
     ] = None,
     sample: Annotated[
         int, typer.Option(metavar="N", min=0, help="Samples of the fields with LOW..HIGH.")
@@ -70,7 +66,7 @@ def sweep_command(
         str | None,
         typer.Option(
             metavar="METRIC",
-            help="Also tell the value with least of a metric by month, such as cfp_kg.",
+            help="Also find the value with the lowest metric in each month, such as cfp_kg.",
         ),
     ] = None,
     batch: Annotated[
@@ -91,10 +87,10 @@ def sweep_command(
     show: Annotated[bool, typer.Option("--show", help="Print what would run, and end.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run all combinations of values, sites, months and controllers, and keep their metrics.
+    """Run all combinations of values, sites, months and controllers, and store their metrics.
 
-    Writes a Parquet dataset with a row for each run. Ctrl-C ends the sweep, and --resume goes on
-    with it. A combination that is not valid is reported, and the others run.
+    Writes a Parquet dataset with a row for each run. Ctrl-C ends the sweep, and --resume continues
+    it. Combinations that are not valid are reported, and the others run.
     """
     from sdc_taichi.benchmark.store import RESULTS, ResultStore, Study
     from sdc_taichi.benchmark.sweep import check_sweep, sweep_inputs, sweep_jobs
@@ -183,7 +179,7 @@ def _months(text: str | None) -> tuple[int, ...]:
 
 
 def _with_best(sweep: Sweep, metric: str) -> Sweep:
-    """The sweep with the value of the config among those to choose from.
+    """The sweep, with the value of the configuration added to the candidates.
 
     Raises:
         ConfigError: no such metric, or nothing to choose.
@@ -228,12 +224,12 @@ def _print_failures(store: ResultStore) -> tuple[int, int]:
         for each in result.metrics["failed"]:
             reasons.setdefault(each["error"], []).append(each["combination"])
     print_notes(notes)
-    for error, combinations in list(reasons.items())[:_MOST_LINES]:
-        others = f" and {len(combinations) - 1} more" if len(combinations) > 1 else ""
-        print(f"failed: {one_line(f'{combinations[0]}{others}: {error}')}", file=sys.stderr)
-    if len(reasons) > _MOST_LINES:
-        left_out = len(reasons) - _MOST_LINES
-        print(f"failed: {left_out} more reasons, in metrics.json of the jobs", file=sys.stderr)
+    lines = [
+        one_line(f"{' '.join(first_lines(combinations, 1, ''))}: {error}")
+        for error, combinations in reasons.items()
+    ]
+    for line in first_lines(lines, _MOST_LINES, " reasons, in metrics.json of the jobs"):
+        print(f"failed: {line}", file=sys.stderr)
     failed = sum(map(len, reasons.values()))
     return runs - failed, failed
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import typer
 from rich.console import Console
@@ -23,26 +25,27 @@ if TYPE_CHECKING:
     from sdc_taichi.types import StepResult
 
 EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-"""Exit codes of a command that failed, that refused its input, and that Ctrl-C ended."""
+"""Exit codes: failure, invalid input, and interruption by Ctrl-C."""
 MOST_COLUMNS = 12
 """Largest number of data centers that have a column each in a table."""
 SECONDS_BETWEEN_LINES = 30.0
-"""Least time between two lines of progress where there is no terminal."""
+"""Least time between two lines of progress where there is no terminal, in s."""
+_SECONDS_BETWEEN_BARS = 0.1
 
 
 class PlainConsole(Console):
-    """A console that reads no markup in texts, and escapes what a terminal would obey."""
+    """A console without markup that escapes control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text as it is shown; every string of a line or table passes here."""
+        """Escaped text; every string of a line or table passes through here."""
         return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
 
 
 def wide_console(width: int) -> PlainConsole:
-    """A console on standard output, with a given width where that is a pipe or a file."""
+    """A console on standard output, of this width if that is a pipe or a file."""
     return PlainConsole(
         highlight=False, width=None if sys.stdout.isatty() else width, soft_wrap=True
     )
@@ -113,8 +116,25 @@ def figure_text(value: float | None, number_format: str) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else format(value, number_format)
 
 
+def count_text(number: float, noun: str) -> str:
+    """A number and a noun, in the plural where that is due."""
+    return f"{number:,.10g} {noun}" + ("" if number == 1 else "s")
+
+
+def first_lines(lines: Sequence[str], most: int, rest: str) -> list[str]:
+    """The first of many lines, and a line that counts the others.
+
+    Args:
+        lines: the lines.
+        most: largest number of lines that are shown.
+        rest: where the other lines are, or what they are.
+    """
+    more = len(lines) - most
+    return [*lines[:most], f"and {more} more{rest}"] if more > 0 else [*lines]
+
+
 def print_notes(notes: Iterable[str]) -> None:
-    """Print what was found out about the inputs of a run, on stderr."""
+    """Print notes on the inputs of a run on stderr."""
     for note in notes:
         print(f"note: {printable(note)}", file=sys.stderr)
 
@@ -169,10 +189,10 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def exit_if_stopped() -> Iterator[None]:
-    """End the command where Ctrl-C or SIGTERM ends the work on an optimum.
+    """End the command if Ctrl-C or SIGTERM stops the work on an optimum.
 
     Raises:
-        typer.Exit: the work was stopped; how much of it is kept has been printed.
+        typer.Exit: the work was stopped; a message says how much of it is stored.
     """
     from sdc_taichi.optimum import StoppedError
 
@@ -185,7 +205,7 @@ def exit_if_stopped() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], None]]:
-    """Show a progress bar on stderr, if that is a terminal.
+    """Show the progress of a run on stderr, if that is a terminal.
 
     Args:
         steps: number of steps of the run.
@@ -194,45 +214,74 @@ def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], 
     Yields:
         A function to call with the result of every step.
     """
-    if not shown or not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    every = max(1, steps // 1000)
-    with rich_progress() as progress:
-        task = progress.add_task("simulating", total=steps)
+    with stage_bars(shown=shown) as progress:
+        yield lambda result: progress("simulating", result.step + 1, steps)
 
-        def advance(result: StepResult) -> None:
-            if result.step % every == 0:
-                progress.update(task, completed=result.step + 1)
 
-        yield advance
+class StageProgress(Protocol):
+    """Progress callback of a piece of work that has stages."""
+
+    def __call__(self, stage: str, done: int, total: int, text: str | None = None) -> None:
+        """Show how much of a stage is done.
+
+        Args:
+            stage: name of the stage.
+            done: how much of it is done.
+            total: how much there is.
+            text: text beside the bar; None is the name of the stage.
+        """
 
 
 @contextlib.contextmanager
-def stage_bars(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+def stage_bars(*, shown: bool) -> Iterator[StageProgress]:
     """Show a progress bar for each stage of a piece of work on stderr, if that is a terminal.
 
     Args:
         shown: whether to show them at all.
 
     Yields:
-        A function to call with the name of a stage, how much of it is done, and how much there is.
+        The progress callback.
     """
     if not shown or not sys.stderr.isatty():
-        yield lambda _stage, _done, _total: None
+        yield lambda stage, done, total, text=None: None
         return
-    with rich_progress() as progress:
+    with _rich_progress() as progress:
         tasks: dict[str, TaskID] = {}
+        updated_s = 0.0
 
-        def advance(stage: str, done: int, total: int) -> None:
+        def advance(stage: str, done: int, total: int, text: str | None = None) -> None:
+            nonlocal updated_s
+            now_s = time.monotonic()
             if stage not in tasks:
                 tasks[stage] = progress.add_task(stage, total=total)
-            progress.update(tasks[stage], completed=done, total=total)
+            elif done < total and now_s - updated_s < _SECONDS_BETWEEN_BARS:
+                return
+            updated_s = now_s
+            progress.update(tasks[stage], completed=done, total=total, description=text or stage)
 
         yield advance
 
 
-def rich_progress() -> Progress:
+class ProgressLines:
+    """Progress as lines on stderr where there is no terminal: one every half a minute."""
+
+    def __init__(self) -> None:
+        self._printed_s = -math.inf
+
+    def print(self, text: str, *, always: bool) -> None:
+        """Print a line if the last one is old enough.
+
+        Args:
+            text: the line.
+            always: print it in any case.
+        """
+        now_s = time.monotonic()
+        if always or now_s - self._printed_s >= SECONDS_BETWEEN_LINES:
+            self._printed_s = now_s
+            print(text, file=sys.stderr, flush=True)
+
+
+def _rich_progress() -> Progress:
     """Progress bars on stderr that disappear when they are done."""
     from rich.progress import (
         BarColumn,

@@ -1,4 +1,4 @@
-"""``sdc-taichi train``: train agents, and keep their policies."""
+"""``sdc-taichi train``: train agents and save their policies."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from sdc_taichi.cli.options import (
 )
 from sdc_taichi.cli.terminal import (
     EXIT_INTERRUPTED,
-    SECONDS_BETWEEN_LINES,
+    ProgressLines,
     duration,
     interruptible,
-    rich_progress,
+    stage_bars,
 )
 from sdc_taichi.errors import ConfigError, printable, suggestion_or_valid
 
@@ -67,11 +67,11 @@ def train_command(
     ] = None,
     agents: Annotated[
         str | None,
-        typer.Option(metavar="NAME[,NAME]", help="Who learns: load, cooling, battery."),
+        typer.Option(metavar="NAME[,NAME]", help="Agents that learn: load, cooling, battery."),
     ] = None,
     others: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Controller of the agents that do not. [default: idle]"),
+        typer.Option(metavar="NAME", help="Controller of the other agents. [default: idle]"),
     ] = None,
     rewards: Annotated[
         str | None,
@@ -94,9 +94,7 @@ def train_command(
     out: Annotated[
         Path | None, out_option("Folder of the training. [default: runs/ALGORITHM-SEED]", "DIR")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in --out.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume the training in --out.")] = False,
     show: Annotated[
         bool, typer.Option("--show", help="Print all settings as YAML, and do not train.")
     ] = False,
@@ -128,7 +126,7 @@ def train_command(
     folder = Path("runs") / f"{chosen.algorithm}-{chosen.seed}" if out is None else out
     from sdc_taichi.learning import train
 
-    with interruptible() as interrupted, progress_of_training(shown=not quiet) as reports:
+    with interruptible() as interrupted, _progress_of_training(shown=not quiet) as reports:
         done = train(chosen, folder, resume=resume, stop=interrupted, **reports)
     if not quiet:
         _print_summary(done)
@@ -142,13 +140,13 @@ def train_command(
 
 
 def _settings(
-    given: dict[str, Any],
+    changes: dict[str, Any],
     source: list[str] | None,
     assigned: list[str],
     file: Path | None,
     resumed: Path | None,
 ) -> TrainingSettings:
-    """Settings of a file or of the training that is resumed, with those given on top."""
+    """Settings of a file or of the training that is resumed, with changes on top."""
     from sdc_taichi.config import apply_override
     from sdc_taichi.learning.training_folder import settings_of
     from sdc_taichi.learning.training_settings import (
@@ -162,7 +160,7 @@ def _settings(
         values = settings_of(resumed).model_dump(mode="json")
     if file is not None:
         values = merged(values, read_values(file))
-    values = merged(values, given)
+    values = merged(values, changes)
     config, overrides = parse_source(source)
     if config is not None:
         values["config"] = config
@@ -178,21 +176,21 @@ def _settings(
 
 
 def _agents(text: str) -> list[str]:
-    """Agents by the names of what they command, or by their own."""
+    """Agents by the names of their commands, or by their own names."""
     from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
     by_name = {d.command: agent for agent, d in AGENT_DEFINITIONS.items()}
     by_name |= {agent: agent for agent in AGENT_DEFINITIONS}
-    found = []
+    names = []
     for name in (part.strip() for part in text.split(",")):
         if name not in by_name:
             raise ConfigError(f"--agents {text!r}: {name!r}{suggestion_or_valid(name, by_name)}")
-        found.append(by_name[name])
-    return found
+        names.append(by_name[name])
+    return names
 
 
 @contextlib.contextmanager
-def progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
+def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
     """Show the progress of a training on stderr: bars in a terminal, lines elsewhere.
 
     Args:
@@ -203,45 +201,24 @@ def progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
     """
     if not shown:
         yield {}
-    elif sys.stderr.isatty():
-        with rich_progress() as progress:
-            tasks: dict[str, Any] = {}
+        return
+    lines, has_lines = ProgressLines(), not sys.stderr.isatty()
+    begun: set[str] = set()
+    with stage_bars(shown=True) as progress:
 
-            def advance(name: str, done: int, total: int, text: str | None = None) -> None:
-                if name not in tasks:
-                    tasks[name] = progress.add_task(name)
-                description = name if text is None else text
-                progress.update(tasks[name], completed=done, total=total, description=description)
+        def update(now: Progress) -> None:
+            progress("training", now.update, now.updates, _line(now))
+            if has_lines:
+                always = now.update == now.updates or now.validation is not None
+                lines.print(f"update {now.update}/{now.updates}: {_line(now)}", always=always)
 
-            def update(now: Progress) -> None:
-                advance("training", now.update, now.updates, _line(now))
+        def stage(name: str, done: int, total: int) -> None:
+            progress(name, done, total)
+            if has_lines and name not in begun:
+                begun.add(name)
+                print(f"{name}: {total:,}", file=sys.stderr, flush=True)
 
-            yield {"on_update": update, "on_stage": advance}
-    else:
-        lines = _Lines()
-        yield {"on_update": lines.update, "on_stage": lines.stage}
-
-
-class _Lines:
-    """Progress in lines, not too many of them."""
-
-    def __init__(self) -> None:
-        self._told_s = -SECONDS_BETWEEN_LINES
-        self._stages: set[str] = set()
-
-    def update(self, now: Progress) -> None:
-        """Tell of an update, if there is something to tell."""
-        is_last = now.update == now.updates
-        waited = now.passed_s - self._told_s >= SECONDS_BETWEEN_LINES
-        if is_last or waited or now.validation is not None:
-            self._told_s = now.passed_s
-            print(f"update {now.update}/{now.updates}: {_line(now)}", file=sys.stderr, flush=True)
-
-    def stage(self, name: str, _done: int, total: int) -> None:
-        """Tell of a stage when it begins."""
-        if name not in self._stages:
-            self._stages.add(name)
-            print(f"{name}: {total:,}", file=sys.stderr, flush=True)
+        yield {"on_update": update, "on_stage": stage}
 
 
 def _line(now: Progress) -> str:
@@ -255,16 +232,22 @@ def _line(now: Progress) -> str:
     return "; ".join(parts)
 
 
-def _validation_text(found: Validation) -> str:
+def _validation_text(validation: Validation) -> str:
     """Figure, share of the achievable and broken constraints of a validation, as text."""
-    change = f"{found.change_pct:+.2f} % against idle"
-    share = f", {100.0 * found.share:.1f} % of the achievable" if found.share == found.share else ""
-    broken = f", {found.broken_weeks} weeks break a constraint" if found.broken_weeks else ""
+    change = f"{validation.change_pct:+.2f} % against idle"
+    share = (
+        f", {100.0 * validation.share:.1f} % of the achievable"
+        if validation.share == validation.share
+        else ""
+    )
+    broken = (
+        f", {validation.broken_weeks} weeks break a constraint" if validation.broken_weeks else ""
+    )
     return f"{change}{share}{broken}"
 
 
 def _print_summary(done: Training) -> None:
-    """Print how far a training has come, its best policy, and how to use it."""
+    """Print the steps of a training, its best policy, and how to use it."""
     speed = f"{done.steps:,} steps in {done.updates:,} updates, {duration(done.seconds)}"
     print(f"{speed}; files in {printable(done.folder)}")
     if done.best is not None:

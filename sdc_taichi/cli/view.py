@@ -150,7 +150,7 @@ def _page_port() -> int:
 
 
 def viewer_program() -> Path:
-    """The viewer's binary: Rerun's ``rerun`` script is a wrapper whose child outlives it.
+    """Binary of the viewer. Rerun's ``rerun`` script would leave it running when it is ended.
 
     Raises:
         SdcError: rerun-sdk is missing.
@@ -169,10 +169,10 @@ def viewer_program() -> Path:
         folder / "rerun.exe",
         folder / "rerun",
     ]
-    found = next((path for path in candidates if path.is_file()), None)
-    if found is None:
+    viewer = next((path for path in candidates if path.is_file()), None)
+    if viewer is None:
         raise SdcError(f"{folder}: no viewer there; install it with: pip install rerun-sdk")
-    return found
+    return viewer
 
 
 def _run_viewer(command: list[str]) -> int:

@@ -1,7 +1,7 @@
 """Weather, grid carbon intensity and workload: embedded synthetic years and files of the user.
 
-Everything that comes from outside the data center is read, checked and brought to steps here.
-What the data center does with it never is.
+These modules read and check everything that comes from outside the data center, and resample it to
+the steps of a simulation. They do not model what the data center does with it.
 """
 
 from sdc_taichi.exogenous.carbon import read_carbon
@@ -14,8 +14,7 @@ from sdc_taichi.exogenous.registry import (
     site_pressure_pa,
     trace_names,
 )
-from sdc_taichi.exogenous.series import Series, SiteData, Weather, resample
-from sdc_taichi.exogenous.statistics import statistics
+from sdc_taichi.exogenous.series import Series, SiteData, Weather, resample, statistics
 from sdc_taichi.exogenous.synthetic import synthetic_site, synthetic_trace
 from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.workload import read_workload

@@ -39,8 +39,8 @@ def read_carbon(
 ) -> Series:
     """Read carbon intensity and bring it to the site's local standard time.
 
-    The table has a ``timestamp`` with its UTC offset, generation of WND SUN WAT OIL NG COL NUC OTH
-    (any energy unit; all eight or none) and ``avg_CI`` in g CO2e/kWh. A Parquet file written by
+    The table has a ``timestamp`` with its UTC offset, generation from WND SUN WAT OIL NG COL NUC
+    OTH (any energy unit; all eight or none) and ``avg_CI`` in g CO2e/kWh. A Parquet file written by
     ``data import`` is taken as it is, and must be for the same UTC offset.
 
     Stamps are moved to local standard time, 29 February is removed, and hours that fall before
@@ -55,10 +55,10 @@ def read_carbon(
         stamp: what a stamp marks.
         pairing: ``"utc_rows"`` keeps the order of the rows as the released SustainDC does, which
             pairs UTC hours with local ones.
-        longitude_deg: of the site, for ``"auto"`` and for a warning if the sun of the grid is
-            another; None is the middle of the time zone, without a warning.
-        columns: names above, with their units where they are others, and the names that they
-            have in the table, such as ``{"timestamp": "Datetime (UTC)", "avg_CI:lb/MWh": "MOER"}``
+        longitude_deg: longitude of the site, for ``"auto"`` and for a warning if solar generation
+            does not fit it; None is the middle of the time zone, without a warning.
+        columns: names of the columns above, with their units where these differ, and the names in
+            the table, such as ``{"timestamp": "Datetime (UTC)", "avg_CI:lb/MWh": "MOER"}``
             (``exogenous.columns``); stamps of a column whose name says UTC need no offset.
 
     Returns:
@@ -232,7 +232,7 @@ def _repair(
 def _suspicious_rows(
     fuels: FloatArray, total: FloatArray, median: FloatArray
 ) -> list[tuple[NDArray[np.bool_], str]]:
-    """Rows that look wrong but are kept, (T,), with the reason; only reasons that occur."""
+    """Rows that look wrong but stay, (T,), with the reason; only reasons that occur."""
     nuclear, other = fuels[:, FUELS.index("NUC")], fuels[:, FUELS.index("OTH")]
     reporting = np.where(np.isnan(total), np.inf, (fuels > 0.0).sum(axis=1))
     kinds = [

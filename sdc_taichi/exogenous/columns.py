@@ -1,7 +1,7 @@
-"""Columns of tables that have other names and units than the readers expect.
+"""Names and units of the columns of a table, where they differ from those that readers expect.
 
 A column is named ``NAME=COLUMN``, or ``NAME:UNIT=COLUMN`` where its numbers are in another unit.
-Units are what the user says; none is taken from the name of a column or from its numbers.
+The user states the unit. It is never inferred from the name of a column or from its numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Numbers = TypeVar("Numbers", float, np.ndarray)
 
 
 class Unit(NamedTuple):
-    """A unit by its zero and its size in the unit of the reader."""
+    """A unit, as a linear function of the unit that the reader expects."""
 
     symbol: str
     """Symbol, for messages; empty for the unit of the reader."""
@@ -77,14 +77,14 @@ class ColumnMap(NamedTuple):
     names: Mapping[str, str]
     """Names in the table."""
     units: Mapping[str, Unit]
-    """Units, of columns whose unit was named."""
+    """Units of the columns whose unit the user has stated."""
 
     def unit(self, name: str) -> Unit:
         """Unit of a column."""
         return self.units.get(name, Unit(""))
 
     def notes(self) -> list[str]:
-        """What was read as what."""
+        """Notes that say which column was read as which quantity."""
         return [
             f"{column} read as {name}" + (f", in {unit.symbol}" if unit.symbol else "")
             for name, column in self.names.items()

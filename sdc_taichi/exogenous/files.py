@@ -1,4 +1,4 @@
-"""Reading of tables: text to numbers, faults by place, gaps, and whole years.
+"""Tables of text files: numbers, time stamps, errors that name the row, gaps, and whole years.
 
 Rows are lines of the file counted from 1, headers included, as an editor shows them (rows of a
 Parquet file count from 1 without headers).
@@ -192,7 +192,7 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
 
     Args:
         path: the file.
-        columns: names that columns get, and their names in the file; the others keep theirs.
+        columns: new names of columns, and their names in the file.
 
     Raises:
         DataError: not readable as a table, without rows, or without one of ``columns``.
@@ -294,7 +294,9 @@ def read_schema(path: Path) -> pa.Schema:
 
 
 def mapping_hint(columns: Iterable[object]) -> str:
-    """End of a message about columns: how a table of Electricity Maps is imported; else empty.
+    """Hint for a message about columns that says how to import a table of Electricity Maps.
+
+    Empty for other tables.
 
     Args:
         columns: names of the columns of the file.
@@ -316,7 +318,7 @@ def fill_gaps(
     columns: Sequence[str],
     rows: NDArray[np.int64],
 ) -> FloatArray:
-    """Interpolate NaN linearly; at an end, the value beside it is kept.
+    """Interpolate missing values (NaN) linearly; at the ends, repeat the nearest value.
 
     Args:
         path: file, for messages.
@@ -463,7 +465,7 @@ def grid_of_stamps(
         Resolution in minutes (the most frequent step), and places from 0, (T,).
 
     Raises:
-        DataError: stamps repeat, go back, are off the grid, or leave a gap over 24 h.
+        DataError: stamps repeat, decrease, are not on the grid, or leave a gap of more than 24 h.
     """
     path, rows = table.path, table.frame.index
     if stamps.size < 2:

@@ -54,7 +54,7 @@ class Imported:
 
 
 def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Whether a file is ``weather``, ``weather table``, ``carbon`` or ``workload``, by its content.
+    """Kind of a file by its content: ``weather``, ``weather table``, ``carbon`` or ``workload``.
 
     Args:
         path: the file.
@@ -91,7 +91,7 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a file was fetched from, to be kept with its data."""
+    """Source of a fetched file, which is stored with its data."""
 
     service: str
     """Name of the service, with its publisher."""
@@ -196,8 +196,8 @@ def site_clock(
 ) -> tuple[float, float | None]:
     """UTC offset of a site, in h, and its longitude, in degrees east, None if it is not known.
 
-    The offset is that of the weather imported under the same name, else ``utc_offset_h``, else
-    the base's.
+    The offset is that of the weather imported under the same name. Without weather it is
+    ``utc_offset_h``, and without that the offset of the base.
 
     Args:
         name: name of the site.
@@ -245,9 +245,9 @@ def import_workload(
 def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
     """Plan the import of a SustainDC ``data`` folder, or of one with carbon, weather, workload.
 
-    Every weather file becomes a site, with the carbon file of its state: ``NY-real`` for the
-    station the embedded year is fitted to (else the first of the state), other stations with
-    their name added. Every workload file becomes a trace.
+    Every weather file becomes a site, with the carbon file of its state. The station that the
+    embedded year is fitted to, or without it the first of the state, is named like ``NY-real``;
+    other stations have their own name added. Every workload file becomes a trace.
 
     Returns:
         Kind, path and name of each import, weather before carbon; and the files left out, each

@@ -1,6 +1,6 @@
 """Sites and workload traces by name: the embedded ones and those the user imported.
 
-Imported files lie in ``$SDC_TAICHI_DATA``, else in the platform's folder for user data:
+Imported files are in ``$SDC_TAICHI_DATA``, or in the platform's folder for user data:
 ``sites/NAME/weather.parquet``, ``sites/NAME/carbon.parquet``, ``traces/NAME.parquet``. An imported
 name never hides an embedded one.
 """
@@ -36,7 +36,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def user_data_dir(data_dir: str | Path | None = None) -> Path:
-    """Folder of imported files: the argument, else ``$SDC_TAICHI_DATA``, else the platform's."""
+    """Folder of imported files: the argument, ``$SDC_TAICHI_DATA``, or the platform's folder."""
     if data_dir is not None:
         return Path(data_dir)
     if os.environ.get("SDC_TAICHI_DATA"):
@@ -204,7 +204,7 @@ def site_from_files(
         base: site that gives what is missing; None if both files are given.
         weather: EPW or imported Parquet.
         carbon: CSV or imported Parquet.
-        name: of the site; the base's, else the weather file's stem.
+        name: name of the site; None is that of the base, or the stem of the weather file.
         stamp: what a stamp of the carbon file marks, see ``read_carbon``.
         pairing: see ``read_carbon``.
 

@@ -1,8 +1,8 @@
 """Meaning of the stamps of a carbon file: the start or the end of their interval.
 
-EIA-930 stamps mark the end of the hour, yet some authorities report the start, or did until some
-day. Solar generation tells: its centre of gravity lies after solar noon where stamps mark the end,
-before it where they mark the start.
+EIA-930 stamps mark the end of the hour, but some authorities report the start, or did so until some
+day. Solar generation shows which: its centre of gravity is after solar noon where stamps mark the
+end of the hour, and before it where they mark the start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Stamp = Literal["auto", "start", "end"]
 """Moment of its interval that a stamp marks; ``auto`` infers it from the solar generation."""
 
 HAS_OFFSET = r"(?:[Zz]|UTC|[+-]\d\d:?\d\d)$"
-"""Regular expression of the end of a stamp that tells its UTC offset."""
+"""Regular expression of a UTC offset at the end of a stamp."""
 
 
 def by_start_of_interval(
@@ -71,7 +71,7 @@ def by_start_of_interval(
 def region_notes(
     solar: FloatArray, local: np.datetime64, minutes: float, noon_h: float
 ) -> list[str]:
-    """A warning if the sun over a grid is not that of the site, else nothing.
+    """Warning of solar generation that does not fit the longitude of the site, or an empty list.
 
     Args:
         solar: solar generation in the order of the file, any unit, (T,).

@@ -156,7 +156,7 @@ class Basis(NamedTuple):
     columns: FloatArray
     """One function per column, (hours, functions)."""
     products: FloatArray
-    """Scalar products of the columns, (functions, functions); costly, hence kept."""
+    """Scalar products of the columns, (functions, functions), stored because they are costly."""
 
     def project(self, z: FloatArray) -> FloatArray:
         """Least-squares coefficients, (functions,), of values z, (hours,)."""
@@ -199,7 +199,7 @@ def climatology_basis(annual: int, diurnal: int, products: tuple[int, ...]) -> B
 
 
 def trace_basis(hours: int, annual: int, diurnal: int, weekly: int) -> Basis:
-    """Constant and harmonics of the year, the day and the week over the first hours of a year.
+    """Constant and harmonics of the year, the day and the week, for the first hours of a year.
 
     Args:
         hours: length.
@@ -265,7 +265,8 @@ def seeded_normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
 def _filtered(kicks: FloatArray, phi: float) -> FloatArray:
     """``x[t] = phi * x[t - 1] + kicks[t]`` along the first axis.
 
-    By doubling: the sum over 2 n kicks is that over n plus ``phi**n`` times that over the n before.
+    By doubling: the sum of 2 n kicks is the sum of the last n, plus ``phi**n`` times the sum of the
+    n before them.
     """
     x, n, weight = kicks.copy(), 1, phi
     while n < len(x) and weight > 1e-20:
@@ -370,7 +371,7 @@ def _weather(
     )
     dew_point = np.minimum(
         dew_point, outdoor
-    )  # drawn apart, so they may cross; the air is saturated then
+    )  # The two are drawn separately and may cross; the air is then saturated.
     mean, spread, memory_h = figures["P"]
     pressure = mean + spread * _ar1(noise[4], math.exp(-1.0 / memory_h))
     humidity = np.clip(relative_humidity_from_dew_point_pct(outdoor, dew_point), 1.0, 100.0)

@@ -62,7 +62,7 @@ _HUMIDITY = _Column("relative humidity (column 9)", HUMIDITY_LIMITS_PCT, 999.0)
 _PRESSURE = _Column("station pressure (column 10)", PRESSURE_LIMITS_PA, 999_999.0)
 _MEASURED = (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE)
 _COLUMN_NAMES = ["year", _MONTH, _DAY, _HOUR, "minute", "source", *(c.name for c in _MEASURED)]
-"""First columns of a row; the others are not read."""
+"""Names of the first columns of a row, the only ones that are read."""
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns that give the weather; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
@@ -263,7 +263,7 @@ def _design_conditions(lines: list[str]) -> tuple[DesignConditions | None, list[
 
 
 def _pressure_notes(pressure: FloatArray, minutes: float, elevation_m: float) -> list[str]:
-    """Warning of months whose pressure is not that of the height of the station."""
+    """Warning of months whose mean pressure does not fit the elevation of the station."""
     standard_pa = float(standard_pressure_pa(elevation_m))
     days = pressure.reshape(-1, DAYS_PER_YEAR, round(MINUTES_PER_DAY / minutes))
     means_pa = np.array([days[:, a:b].mean() for a, b in pairwise(FIRST_DAY_OF_MONTH)])

@@ -60,16 +60,16 @@ def read_weather_table(
 ) -> Weather:
     """Read weather from a table with ``timestamp`` and ``dry_bulb``.
 
-    It also has ``relative_humidity``, or ``dew_point`` from which it follows (ASHRAE Fundamentals
-    2017, ch. 1), and may have ``pressure``, which is else that of the standard atmosphere. Stamps
-    are in local standard time, or have a UTC offset each; 29 February is removed, and gaps of up
-    to 24 h are interpolated.
+    It also has ``relative_humidity``, or ``dew_point`` from which humidity follows (ASHRAE
+    Fundamentals 2017, ch. 1), and may have ``pressure``. Without pressure, that of the standard
+    atmosphere is used. Stamps are in local standard time, or each has a UTC offset; 29 February is
+    removed, and gaps of up to 24 h are interpolated.
 
     Args:
         path: CSV or Parquet.
         place: where the station is.
-        columns: the names above, with their units where they are others than C, % and Pa, and the
-            names in the table, such as ``{"dry_bulb:F": "Temp", "dew_point:F": "Dew"}``
+        columns: the names above, with units other than C, % and Pa, and the names in the table,
+            such as ``{"dry_bulb:F": "Temp", "dew_point:F": "Dew"}``
             (``exogenous.columns``).
         stamp: whether a stamp marks the start or the end of its interval.
 

@@ -1,13 +1,13 @@
-"""Downloads over HTTP, kept with their origin, so that a second fetch needs no network.
+"""Downloads over HTTP, stored with their origin, so that a second fetch needs no network.
 
-A download ends in time: with a whole answer, or with an error of one line. Attempts are repeated
-after failures that may pass (no connection, no answer, statuses 408, 425, 429 and 5xx, an answer
-that is cut off), with waits that double or that the service asks for. No text of the HTTP library
-reaches a message, since it would quote the address with the key.
+A download ends within a limited time, with a whole answer or with an error of one line. After
+temporary failures (no connection, no answer, statuses 408, 425, 429 and 5xx, an answer that is cut
+off) the request is repeated, after waits that double or that the service asks for. Messages contain
+no text of the HTTP library, which would quote the address with the key.
 
-Answers lie in the folder of imported files, under ``downloads/SERVICE``: each file as the service
-sent it, without the key, and beside it ``NAME.origin.json`` with its address, time, checksum and
-licence.
+Answers are stored in the folder of imported files, under ``downloads/SERVICE``: each file as the
+service sent it, without the key, and beside it ``NAME.origin.json`` with its address, time,
+checksum and licence.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Request:
     address: str
     """Address without query."""
     file_name: str
-    """Name of the file that the answer is kept in."""
+    """Name of the file in which the answer is stored."""
     query: Mapping[str, str] = field(default_factory=dict)
     """Parameters of the query, without the key."""
     key: str = field(default="", repr=False)
@@ -81,7 +81,7 @@ class Request:
     by_hand: str = ""
     """What a user can do where the service cannot be reached, for messages."""
     check: Callable[[bytes, str], object] = lambda content, origin: None
-    """Reads an answer, given the address for messages; raises DataError if it is not what was
+    """Reads an answer, with the address for messages; raises DataError if it is not what was
     requested."""
     most_bytes: int = MOST_DOWNLOAD_BYTES
     """Largest valid answer, in bytes."""
@@ -100,7 +100,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Kept:
-    """An answer of a service, kept in a file."""
+    """An answer of a service that is stored in a file."""
 
     path: Path
     """File that holds the answer."""
@@ -152,17 +152,17 @@ def fetch(
     patience: Patience | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Kept]:
-    """Answers to requests: those kept before, and the others downloaded and kept.
+    """Answers to requests, from the store or downloaded and then stored.
 
     Args:
         requested: the requests.
         data_dir: folder of imported files instead of the user's.
-        refresh: download again what is kept.
+        refresh: download again what is stored.
         patience: limits of time and attempts of each download.
         progress: callback with the number of answers that are there, and of all.
 
     Raises:
-        DataError: an answer is not to be had or not valid; those before it are kept.
+        DataError: an answer is not available or not valid; earlier answers stay stored.
     """
     answers = []
     for done, request in enumerate(requested):
@@ -199,7 +199,7 @@ def write_file(path: Path, content: bytes) -> Path:
 
 
 def downloads_dir(service: Service, data_dir: Path | None = None) -> Path:
-    """Folder in which answers of a service are kept."""
+    """Folder in which answers of a service are stored."""
     return user_data_dir(data_dir) / "downloads" / service.name
 
 
@@ -363,7 +363,7 @@ def _paths(request: Request, data_dir: Path | None) -> tuple[Path, Path]:
 
 
 def _kept(request: Request, data_dir: Path | None) -> Kept | None:
-    """The answer that is kept; None if there is none, or it is damaged or to another request."""
+    """The stored answer; None if there is none, or it is damaged or belongs to another request."""
     path, origin_path = _paths(request, data_dir)
     if not (path.is_file() and origin_path.is_file()):
         return None

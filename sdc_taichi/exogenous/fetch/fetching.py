@@ -42,7 +42,7 @@ class Destination:
     data_dir: Path | None = None
     """Folder of imported files instead of the user's."""
     refresh: bool = False
-    """Whether to download again what is kept."""
+    """Whether to download again what is stored."""
     patience: Patience | None = None
     """Limits of time of each download; None are the usual ones."""
     progress: Callable[[int, int], None] = lambda done, total: None
@@ -50,7 +50,7 @@ class Destination:
 
     @contextlib.contextmanager
     def checking(self) -> Iterator[None]:
-        """Add to what the reader refuses how to download it again.
+        """Add to errors of the reader how to download the data again.
 
         Raises:
             DataError: in place of one without the hint.
@@ -61,7 +61,7 @@ class Destination:
             raise DataError(f"{error}; --refresh downloads it again") from None
 
     def downloads(self, requested: Sequence[Request]) -> list[Kept]:
-        """Answers to requests, downloaded or kept from before."""
+        """Answers to requests, downloaded or from the store."""
         return fetch(
             requested,
             self.data_dir,
@@ -88,7 +88,7 @@ def fetch_pvgis(
         file: answer of PVGIS that was downloaded by hand; None to download it.
 
     Raises:
-        DataError: no typical year is to be had, or it is not valid.
+        DataError: no typical year is available, or it is not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
     request = weather.request_year(latitude_deg, longitude_deg)
@@ -115,7 +115,7 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
         url: address of the file, or of a ZIP archive that holds it.
 
     Raises:
-        DataError: no EPW file is to be had, or it is not valid.
+        DataError: no EPW file is available, or it is not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
     request = weather.request_epw(url)
@@ -146,7 +146,7 @@ def fetch_generation(
         utc_offset_h: of the site, in h; None is that of its weather or base.
 
     Raises:
-        DataError: no key, or the generation is not to be had or not valid.
+        DataError: no key, or the generation is not available or not valid.
     """
     service = services()[service_name]
     _check(into, service, year, utc_offset_h)
@@ -187,7 +187,7 @@ def fetch_electricity_maps(
         release: day of the release of the table.
 
     Raises:
-        DataError: the table is not to be had or not valid.
+        DataError: the table is not available or not valid.
     """
     service = services()["electricity-maps"]
     _check(into, service, year, utc_offset_h)
@@ -242,7 +242,7 @@ def _intensity_columns(content: bytes, url: str) -> dict[str, str]:
 
 
 def _check(into: Destination, service: Service, year: int, utc_offset_h: float | None) -> None:
-    """Check before any download that the year is over and that the site has a name and a clock."""
+    """Check, before any download, that the year has ended and the site has a name and a clock."""
     this_year, first = datetime.now(UTC).year, service.first_year or 0
     if not first <= year < this_year:
         raise DataError(

@@ -33,7 +33,6 @@ MOST_EIA_ROWS = 5000
 """Largest number of rows of an answer of EIA-930."""
 _EIA_FIRST_DAYS = (1, 11, 21)
 """Days of a month on which a request to EIA-930 begins: 11 days of 18 sources are 4,752 rows."""
-_STAMP = "%Y-%m-%dT%H:%MZ"
 _RESOLUTION_MIN = {"PT15M": 15, "PT30M": 30, "PT60M": 60, "PT1H": 60}
 _SLOT_MIN = 15
 """Length of the slots that intervals of ENTSO-E are divided into, in minutes."""
@@ -297,12 +296,12 @@ def _run(
 def _time(text: str, url: str) -> datetime:
     """A time in UTC by its stamp, such as 2024-01-31T23:00Z."""
     with contextlib.suppress(ValueError):
-        return datetime.strptime(text.replace(":00Z", "Z") if text.count(":") > 1 else text, _STAMP)
+        return datetime.strptime(re.sub(r"(:\d\d):00Z$", r"\1Z", text), "%Y-%m-%dT%H:%MZ")
     raise DataError(f"{url}: time {shortened(text)}, expected one such as 2024-01-31T23:00Z")
 
 
 def _text(element: ElementTree.Element, name: str, url: str) -> str:
-    """Text of the first descendant with a name."""
+    """Text of the first descendant element with a name."""
     text = next((x.text for x in element.iter(name) if x.text), None)
     if text is None:
         raise DataError(f"{url}: no {name}, so the format is not the one known here")

@@ -1,8 +1,7 @@
 """Tables of carbon intensity and generation that were saved by hand from the pages of services.
 
-Each service has a layout of its own (``services.yaml``). A layout is brought to the carbon table
-that ``read_carbon`` reads, which is kept beside the downloads of the service and imported as these
-are.
+Each service has its own layout (``services.yaml``). A table is converted to the carbon table that
+``read_carbon`` reads, which is stored beside the downloads of the service and imported like them.
 """
 
 from __future__ import annotations
