@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
+from typer.testing import CliRunner, Result
+
+from sdc_taichi.cli.data import data_app
 
 EPW_HEADER = (
     "LOCATION,Test.Station,NY,USA,TEST,000000,40.70000,-75.00000,{offset},10.0",
@@ -118,3 +121,11 @@ def with_cell(lines: Sequence[str], row: int, column: int, value: str) -> list[s
 def without_rows(lines: Sequence[str], first: int, last: int) -> list[str]:
     """Remove rows first to last, both included."""
     return [*lines[: first - 1], *lines[last:]]
+
+
+def run_data(*arguments: str) -> Result:
+    """Result of ``sdc-taichi data``; its errors are raised."""
+    result = CliRunner().invoke(data_app, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result

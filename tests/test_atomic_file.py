@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sdc_taichi.atomic_file import AtomicFile, FileClaim, atomic_write
+from sdc_taichi.atomic_file import AtomicFile, atomic_write
 from sdc_taichi.errors import SdcError
 
 
@@ -47,15 +47,6 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert names(tmp_path) == ["a.txt"]
 
 
-def test_a_discarded_file_never_appears_and_a_committed_one_stays(tmp_path: Path) -> None:
-    given_up, kept = AtomicFile(tmp_path / "a"), AtomicFile(tmp_path / "b")
-    assert names(tmp_path) == [".a.part", ".b.part"]
-    given_up.discard()
-    kept.commit()
-    kept.discard()
-    assert names(tmp_path) == ["b"]
-
-
 def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(SdcError, match=r"missing.a: cannot be written: No such file"):
         AtomicFile(tmp_path / "missing" / "a")
@@ -88,11 +79,6 @@ def test_what_a_killed_process_left_is_taken_over(tmp_path: Path) -> None:
         file.write(b"new")
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == ["a.txt"]
-
-
-def test_a_claim_that_is_forgotten_leaves_nothing(tmp_path: Path) -> None:
-    FileClaim(tmp_path / "a")
-    assert names(tmp_path) == []
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no locks on Windows")

@@ -33,7 +33,6 @@ from sdc_taichi import (
 )
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import View, make_controller
-from sdc_taichi.run import loop
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_writer import simulate_to_folder
 
@@ -162,15 +161,6 @@ def test_totals_are_sums_and_ratios_of_sums(two_sites: Path) -> None:
     assert total["hottest_inlet_c"] == hottest["metrics"]["hottest_inlet_c"]
 
 
-def test_hottest_rack_is_found_in_its_data_center() -> None:
-    hot = [
-        load_config("tiny", [f"hall.supply_approach_k.{i}=9", f"name=hot-{i}"]) for i in range(4)
-    ]
-    with Simulator(hot) as sim:
-        totals = loop.simulate(sim, make_controller("idle", sim.fleet), 5)
-    assert totals.hottest_rack.tolist() == [0, 1, 2, 3]
-
-
 def test_steps_hold_every_quantity_of_every_step(two_sites: Path) -> None:
     steps = steps_of(two_sites)
     with Simulator(load_config("tiny")) as sim:
@@ -227,13 +217,6 @@ def test_a_data_center_is_the_same_alone_and_in_a_fleet(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(rows.drop(columns="dc"), one.drop(columns="dc"), check_exact=True)
 
 
-def test_copies_are_numbered_and_sites_dealt_in_turn(tmp_path: Path) -> None:
-    report = simulate(tmp_path / "run", "--site", "ny,ca", "--dcs", 5)
-    names = [dc["name"] for dc in report["data_centers"]]
-    assert names == ["ny-0", "ca-1", "ny-2", "ca-3", "ny-4"]
-    assert report["data_centers"][0]["metrics"] == report["data_centers"][2]["metrics"]
-
-
 def test_the_same_command_again_replaces_its_run(tmp_path: Path) -> None:
     out = tmp_path / "run"
     simulate(out, "--site", "ny,ca")
@@ -284,15 +267,6 @@ def test_sampling_varies_the_data_centers_and_repeats(tmp_path: Path) -> None:
     assert {location for _, location in found[0]} == {"NY", "TX"}
 
 
-def test_the_year_turns_after_31_december(tmp_path: Path) -> None:
-    simulate(tmp_path / "run", "--start", "12-31", "--days", 2)
-    times = steps_of(tmp_path / "run")["time"]
-    assert (str(times.iloc[0]), str(times.iloc[96])) == (
-        "2001-12-31 00:00:00",
-        "2002-01-01 00:00:00",
-    )
-
-
 # Inputs from files
 
 
@@ -329,22 +303,6 @@ def test_files_drive_a_run_and_repairs_are_told_once(
     assert steps["outdoor_c"].mean() == pytest.approx(np.mean(file_c), abs=0.1)
     site = load_config(tmp_path / "run" / "config.yaml").site
     assert site.weather_file == str(real_files["weather"])
-
-
-def test_one_file_alone_leaves_the_rest_synthetic(
-    tmp_path: Path, real_files: dict[str, Path]
-) -> None:
-    done = call(
-        "simulate", "tiny", "--days", 1, "--out", tmp_path / "run", "--site", "ny,ca",
-        "--workload", real_files["workload"],
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert "SYNTHETIC" in done.stdout
-    assert "workload: workload.csv" in done.stdout
-    steps = steps_of(tmp_path / "run")
-    assert steps[steps["dc"] == "ny"]["demand"].tolist() == (
-        steps[steps["dc"] == "ca"]["demand"].tolist()
-    )
 
 
 def test_weather_files_go_to_their_sites(tmp_path: Path, real_files: dict[str, Path]) -> None:
@@ -406,24 +364,6 @@ def test_summary_for_few_data_centers(tmp_path: Path) -> None:
         assert len(table[title]) == 3
     assert "SYNTHETIC inputs, not on measurements" in done.stdout
     assert f"Files in {tmp_path / 'run'}: steps.parquet, metrics.json, configs.yaml" in done.stdout
-
-
-def test_summary_for_many_data_centers_is_a_spread(tmp_path: Path) -> None:
-    done = call(
-        "simulate", "tiny", "--days", 1, "--site", "ny,ca", "--dcs", 13, "--out", tmp_path / "run"
-    )
-    report = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    pues = [dc["metrics"]["pue"] for dc in report["data_centers"]]
-    line = next(x for x in done.stdout.splitlines() if x.startswith("│ PUE  "))
-    expected = [min(pues), sum(pues) / 13, max(pues), report["total"]["pue"]]
-    assert [x.strip() for x in line.split("│")[2:-1]] == [f"{v:.4g}" for v in expected]
-    assert "ny-01" not in done.stdout
-
-
-def test_piped_output_holds_nothing_but_the_answer(tmp_path: Path) -> None:
-    done = program("simulate", "tiny", "--days", 0.25, "--json", "--out", tmp_path / "run")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert json.loads(done.stdout)["steps_done"] == 24
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["--version"]])

@@ -58,14 +58,6 @@ def test_a_suite_is_run_and_goes_on_with_what_is_missing(file: Path, tmp_path: P
     assert ResultStore(out).study().command.startswith("sdc-taichi ")
 
 
-def test_a_suite_is_printed_as_it_would_be_run() -> None:
-    done = call("carbon", "--quick", "--show", "--rows", "idle,ippo", "--seeds", "3")
-    values = yaml.safe_load(done.stdout)
-    assert done.exit_code == 0
-    assert (values["seeds"], list(values["rows"])) == (3, ["idle", "ippo"])
-    assert values["cases"]["eight-sites"]["weeks"] == [3, 27]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -17,7 +17,6 @@ from sdc_taichi import Fleet, Simulator
 from sdc_taichi.cli.app import app
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.run import optimum_folder
 from sdc_taichi.run.folder_reader import read_run
 
 CASE = ("tiny", "--site", "ny,ca", "--days", "1", "--start", "07-01")
@@ -150,19 +149,6 @@ def test_interrupted_solver_says_what_it_keeps(
     assert done.exit_code == 130
     assert done.stderr == "interrupted: 1 of 2 data centers are solved and kept\n"
     assert done.stdout == ""
-
-
-def test_interrupted_path_of_the_optimum_leaves_the_run(
-    asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def interrupted(*_: Any, **__: Any) -> bool:
-        return False
-
-    monkeypatch.setattr(optimum_folder, "write_optimum", interrupted)
-    done = call("simulate", *CASE, "--optimum", "carbon", "--out", tmp_path / "run", "--quiet")
-    assert done.exit_code == 130
-    assert "holds it without the path of the optimum" in done.stderr
-    assert "achievable_share" in read_run(tmp_path / "run").metrics["total"]
 
 
 def test_interrupted_controllers_leave_the_figures(

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import exogenous_builders as build
-from sdc_taichi.cli.data import data_app
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import load_site, read_carbon, read_epw, read_workload
+from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.columns import column_map
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
@@ -28,10 +27,7 @@ def user_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(*arguments: str) -> Result:
-    result = CliRunner().invoke(data_app, ["import", *arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+    return build.run_data("import", *arguments)
 
 
 def maps(*mapped: str) -> list[str]:
@@ -179,21 +175,6 @@ def test_stamps_with_an_offset_are_moved(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ends.outdoor_c.values, expected.outdoor_c.values)
 
 
-def test_import_a_weather_table(tmp_path: Path, user_folder: Path) -> None:
-    table = tmp_path / "roof.csv"
-    table.write_text(build.text(weather_lines()))
-    done = run(str(table), "--site", "roof", "--base", "NY", *STATION, *maps(*WEATHER))
-    assert "t read as dry_bulb, in F" in " ".join(done.output.split())
-    site = load_site("roof")
-    assert site.outdoor_c.synthetic is False
-    np.testing.assert_allclose(
-        site.outdoor_c.values,
-        read_weather_table(
-            table, PLACE, columns=dict(text.split("=") for text in WEATHER)
-        ).outdoor_c.values,
-    )
-
-
 @pytest.mark.parametrize(
     ("row", "cell", "value", "message"),
     [
@@ -265,22 +246,3 @@ def test_weather_tables_that_say_too_little(
     with pytest.raises(DataError, match=message):
         run(str(table), "--site", "roof", *arguments)
     assert not user_folder.exists()
-
-
-@pytest.mark.parametrize("kind", ["epw", "carbon", "service"])
-def test_a_place_beside_other_files_is_refused(
-    kind: str, tmp_path: Path, user_folder: Path
-) -> None:
-    path = tmp_path / "file.csv"
-    lines = build.epw_lines() if kind == "epw" else build.carbon_lines()
-    path.write_text(build.text(lines))
-    more = ["--map", "entsoe"] if kind == "service" else []
-    with pytest.raises(DataError, match=r"--latitude: without effect on .*file\.csv"):
-        run(str(path), "--site", "x", "--latitude", "3", *more)
-
-
-def test_several_files_need_a_service(tmp_path: Path, user_folder: Path) -> None:
-    for name in "ab":
-        (tmp_path / f"{name}.csv").write_text("avg_CI\n1\n")
-    with pytest.raises(DataError, match="2 files: expected one, or tables of one service"):
-        run(str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--site", "x")

@@ -21,7 +21,6 @@ from sdc_taichi.exogenous import (
 from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.exogenous.stamps import Stamp
-from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
 
 
 def write(path: Path, lines: list[str] | tuple[str, ...], newline: str = "\n") -> Path:
@@ -71,18 +70,6 @@ def test_a_change_of_what_stamps_mark_is_found(first: str, second: str, tmp_path
     for part in (series.values[: 24 * 150], series.values[24 * 180 :]):
         by_hour = part.reshape(-1, 24).mean(axis=0)
         assert set(np.argsort(by_hour)[:2]) == {11, 12}
-
-
-def test_no_solar_generation_means_stamps_mark_the_end(tmp_path: Path) -> None:
-    lines = [
-        build.CARBON_HEADER,
-        *(
-            f"{row.split(',')[0]},0,0,0,0,{5000 + i % 24},0,0,0,490"
-            for i, row in enumerate(build.carbon_lines()[1:])
-        ),
-    ]
-    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0)
-    assert any("assumed: no solar generation" in note for note in series.notes)
 
 
 def test_hours_before_the_year_wrap_to_its_end(tmp_path: Path) -> None:
@@ -154,16 +141,6 @@ def test_29_february_is_the_local_day(tmp_path: Path) -> None:
     series = read_carbon(write(tmp_path / "ci.csv", numbered), -5.0, "start")
     assert np.all(series.values == 100.0)
     assert "29 February removed (24 rows)" in series.notes
-
-
-@pytest.mark.parametrize("start", [2022, 2023, 2024])
-def test_a_file_from_july_to_june_begins_with_january(start: int, tmp_path: Path) -> None:
-    stamps = build.days(f"{start}-07-01", f"{start + 1}-07-01").astype("datetime64[h]")
-    hours = np.repeat(stamps, 24) + np.tile(np.arange(24), stamps.size)
-    lines = ["timestamp,cpu_load", *(f"{t}:00,{int(str(t)[5:7]) / 100}" for t in hours)]
-    months = np.rint(read_workload(write(tmp_path / "w.csv", lines)).values * 100).astype(int)
-    january_to_december = np.repeat(MONTH_OF_DAY, 24)
-    np.testing.assert_array_equal(months, january_to_december)
 
 
 # Carbon: repairs
@@ -286,13 +263,6 @@ def test_epw_missing_codes_and_gaps_are_interpolated(tmp_path: Path) -> None:
 
 
 # Workload
-
-
-def test_workload_trace(tmp_path: Path) -> None:
-    series = read_workload(write(tmp_path / "w.csv", build.workload_lines()))
-    assert series.values.shape == (8760,)
-    assert series.values[0] == pytest.approx(0.5)
-    assert series.notes == ("blank first header read as index",)
 
 
 def test_workload_longer_than_a_year_is_cut_and_repetition_warned_of(tmp_path: Path) -> None:

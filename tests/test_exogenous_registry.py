@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 import exogenous_builders as build
+from exogenous_builders import run_data as run
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.errors import DataError, SdcError
 from sdc_taichi.exogenous import (
@@ -62,13 +63,6 @@ def epw(sources: Path) -> str:
 
 def carbon(sources: Path) -> str:
     return str(sources / "CarbonIntensity" / "NY_NG_&_avgCI.csv")
-
-
-def run(*arguments: str) -> Result:
-    result = CliRunner().invoke(data_app, list(arguments))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 # Names
@@ -122,13 +116,6 @@ def test_what_no_file_gives_is_taken_from_the_base(sources: Path) -> None:
     assert site.name == "NY"
     assert site.outdoor_c is synthetic_site("NY").outdoor_c
     assert not site.ci_g_per_kwh.synthetic
-
-
-def test_nothing_is_paired_silently(sources: Path) -> None:
-    with pytest.raises(DataError, match="carbon: no file"):
-        site_from_files(None, weather=epw(sources))
-    with pytest.raises(DataError, match="weather: no file"):
-        site_from_files(None, carbon=carbon(sources))
 
 
 @pytest.mark.parametrize(("state", "warned"), [("NY", False), ("CA", True)])
@@ -208,25 +195,10 @@ def test_carbon_needs_a_utc_offset(sources: Path, user_folder: Path) -> None:
         run("import", carbon(sources), "--site", "d", "--utc-offset", "-8")
 
 
-def test_weather_of_another_zone_than_the_stored_carbon(sources: Path, user_folder: Path) -> None:
-    run("import", carbon(sources), "--site", "d", "--utc-offset", "-8")
-    run("import", epw(sources), "--site", "d")
-    with pytest.raises(DataError, match=r"carbon\.parquet: metadata utc_offset_h: -8"):
-        load_site("d")
-
-
 @pytest.mark.parametrize("name", ["NY", "ny", "../x", "", "a b", ".hidden", "x" * 65])
 def test_names_that_cannot_be_imported(name: str, sources: Path, user_folder: Path) -> None:
     with pytest.raises(DataError, match="site "):
         run("import", epw(sources), "--site", name)
-    assert not user_folder.exists()
-
-
-def test_a_rejected_file_leaves_nothing(tmp_path: Path, user_folder: Path) -> None:
-    path = tmp_path / "short.epw"
-    path.write_text(build.text(build.epw_lines()[:1000]))
-    with pytest.raises(DataError, match=r"short\.epw"):
-        run("import", str(path), "--site", "x")
     assert not user_folder.exists()
 
 

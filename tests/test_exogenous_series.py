@@ -76,13 +76,6 @@ def test_the_wrap_is_periodic() -> None:
     np.testing.assert_allclose(out[-4:], [10.0, 14.0, 15.0, 13.0])
 
 
-def test_coarser_steps_average() -> None:
-    five = np.random.default_rng(1).random(365 * 288)
-    out = resample(series(five, 5.0), 4)
-    np.testing.assert_allclose(out, five.reshape(-1, 3).mean(axis=1))
-    assert out.shape == (35040,)
-
-
 def test_coarser_steps_that_do_not_nest_average_by_overlap() -> None:
     out = resample(series([0.0, 12.0, 24.0, 36.0], 15.0), 3)
     # 20 minutes: 15 of the first and 5 of the second, 10 and 10, 5 and 15.

@@ -22,7 +22,7 @@ from sdc_taichi.exogenous import (
     synthetic_trace,
     wet_bulb_c,
 )
-from sdc_taichi.exogenous.synthetic import seeded_normals, synthetic_sites, synthetic_traces
+from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
 
 SEEDS = range(10)
 # Measured years in local standard time: OneBuilding TMYx, EIA-930 2022, Alibaba 2018, Google 2011.
@@ -33,50 +33,15 @@ REAL: dict[str, dict[str, dict[str, float]]] = json.loads(
 # Largest miss of the mean over the ten seeds; one seed alone may miss by twice as much. In
 # standard deviations of the measured series for mean, p1 and p99, absolute for correlations, and
 # relative for the rest.
-TOLERANCE = {
-    "outdoor_c": {
-        "mean": 0.03,
-        "std": 0.02,
-        "p1": 0.01,
-        "p99": 0.01,
-        "diurnal": 0.05,
-        "seasonal": 0.20,
-        "daily_std": 0.08,
-        "acf1": 0.005,
-        "acf24": 0.04,
-    },
-    "wet_bulb_c": {
-        "mean": 0.04,
-        "std": 0.03,
-        "p1": 0.40,
-        "p99": 0.20,
-        "diurnal": 0.08,
-        "seasonal": 0.15,
-        "daily_std": 0.25,
-        "acf1": 0.01,
-        "acf24": 0.06,
-    },
-    "ci_g_per_kwh": {
-        "mean": 0.12,
-        "std": 0.12,
-        "p1": 0.40,
-        "p99": 0.25,
-        "diurnal": 0.16,
-        "seasonal": 0.15,
-        "daily_std": 0.25,
-        "acf1": 0.015,
-        "acf24": 0.06,
-    },
-    "utilisation": {
-        "mean": 0.02,
-        "std": 0.03,
-        "p1": 0.02,
-        "p99": 0.02,
-        "diurnal": 0.06,
-        "daily_std": 0.08,
-        "acf1": 0.02,
-        "acf24": 0.12,
-    },
+STATISTICS = ("mean", "std", "p1", "p99", "diurnal", "seasonal", "daily_std", "acf1", "acf24")
+TOLERANCE: dict[str, dict[str, float]] = {
+    quantity: dict(zip(STATISTICS, tolerances, strict=True))
+    for quantity, tolerances in {
+        "outdoor_c": (0.03, 0.02, 0.01, 0.01, 0.05, 0.20, 0.08, 0.005, 0.04),
+        "wet_bulb_c": (0.04, 0.03, 0.40, 0.20, 0.08, 0.15, 0.25, 0.01, 0.06),
+        "ci_g_per_kwh": (0.12, 0.12, 0.40, 0.25, 0.16, 0.15, 0.25, 0.015, 0.06),
+        "utilisation": (0.02, 0.03, 0.02, 0.02, 0.06, np.inf, 0.08, 0.02, 0.12),
+    }.items()
 }
 # Arizona's carbon intensity varies less between months than the measured year: 127 of 151 g/kWh.
 # Known, and documented in docs/data.md; the bound keeps it from getting worse.
@@ -113,6 +78,7 @@ CASES = [
     for quantity, statistics_of in TOLERANCE.items()
     for place in REAL[quantity]
     for statistic in statistics_of
+    if statistic in REAL[quantity][place]
 ]
 
 
@@ -165,26 +131,7 @@ def test_years_are_physical() -> None:
         assert trace.values.max() <= 1.0
 
 
-def test_solar_sites_are_cleanest_around_local_noon() -> None:
-    for place in ("AZ", "CA"):
-        by_hour = synthetic_site(place).ci_g_per_kwh.values.reshape(365, 24).mean(axis=0)
-        assert 10 <= int(by_hour.argmin()) <= 14
-
-
 # Bit stability
-
-
-def test_normals_are_normal_and_independent_between_sites_and_streams() -> None:
-    a, b, c = (
-        seeded_normals(0, 0, "NY", 50_000),
-        seeded_normals(0, 0, "VA", 50_000),
-        seeded_normals(0, 1, "NY", 9),
-    )
-    assert abs(a.mean()) < 0.02
-    assert abs(a.std() - 1.0) < 0.02
-    assert abs(float(np.mean(a**4)) - 3.0) < 0.2
-    assert abs(float(np.corrcoef(a, b)[0, 1])) < 0.02
-    assert not np.any(a[:9] == c)
 
 
 @pytest.mark.parametrize(

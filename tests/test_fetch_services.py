@@ -28,7 +28,6 @@ from sdc_taichi.exogenous.fetch.generation import (
     eia_rows,
     read_generation,
     year_of_requests,
-    zone_code,
 )
 from sdc_taichi.exogenous.fetch.services import STORAGE, services
 from sdc_taichi.exogenous.fetch.weather import typical_year
@@ -161,12 +160,6 @@ def test_a_wrong_typical_year_is_one_line(
     assert not data_dir.exists()
 
 
-def test_values_beyond_limits_are_found_by_the_reader(run: Callable[..., Result]) -> None:
-    answer = pvgis_answer(lambda year: year["outputs"]["tmy_hourly"][7].update(T2m=99.0))
-    line = error(run(sends(answer), *PVGIS, "--utc-offset=1"))
-    assert "tmy_45.0000_8.0000_utc+1.csv: row 10, column dry_bulb" in line
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -185,11 +178,6 @@ def test_bad_options_are_found_before_any_download(
     run: Callable[..., Result], options: tuple[str, ...], message: str
 ) -> None:
     assert message in error(run(None, *PVGIS, *options))
-
-
-def test_the_sea_is_told(run: Callable[..., Result]) -> None:
-    said = b'{"message": "Location over the sea. Please, select another location"}'
-    assert "Location over the sea" in error(run(sends(said, 400), *PVGIS, "--utc-offset=1"))
 
 
 def test_without_a_network_a_file_saved_by_hand_serves(
@@ -382,33 +370,6 @@ def test_bad_options_of_eia(
     assert message in error(run(None, *EIA, *options))
 
 
-def test_no_key_no_clock_no_authority(
-    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    no_clock = error(run(None, "eia-930", "CISO", "--year=2023", "--site=here"))
-    assert "expected the weather imported first, --base SITE or --utc-offset HOURS" in no_clock
-    bad = error(run(None, "eia-930", "C I", "--year=2023", "--site=here", "--utc-offset=-8"))
-    assert "such as CISO" in bad
-    monkeypatch.delenv("EIA_API_KEY")
-    assert "EIA_API_KEY: not set" in error(run(None, *EIA))
-
-
-def test_a_failure_in_the_middle_keeps_what_came(
-    run: Callable[..., Result], data_dir: Path
-) -> None:
-    answer, seen = eia(), []
-
-    def third_fails(request: Any) -> None:
-        seen.append(request.path)
-        (sends(b"", 404) if len(seen) == 3 else answer)(request)
-
-    assert "404" in error(run(third_fails, *EIA))
-    assert not (data_dir / "sites").exists()
-    assert len(list(data_dir.rglob("CISO_*.json.origin.json"))) == 2
-    assert run(third_fails, *EIA).exit_code == 0
-    assert len(seen) == 3 + 34
-
-
 # ENTSO-E
 
 ENTSOE = ("entsoe", "de-lu", "--year=2024", "--site=here", "--utc-offset=1")
@@ -487,15 +448,6 @@ def test_wrong_documents_are_one_line(
     assert not data_dir.exists()
 
 
-def test_zones_have_names_and_codes() -> None:
-    assert zone_code("de-lu") == zone_code("10Y1001A1001A82H")
-    with pytest.raises(DataError, match="did you mean 'DE_LU'"):
-        zone_code("DELU")
-    for code in services()["entsoe"].zones.values():
-        assert zone_code(code) == code
-    assert len(set(services()["entsoe"].zones.values())) == len(services()["entsoe"].zones)
-
-
 # Electricity Maps
 
 MAPS = ("electricity-maps", "FR", "--year=2023", "--site=here", "--utc-offset=1")
@@ -530,13 +482,6 @@ def test_wrong_tables_are_one_line(
     run: Callable[..., Result], answer: Answer, message: str
 ) -> None:
     assert message in error(run(answer, *MAPS))
-
-
-@pytest.mark.parametrize("options", [("--release=new",), ("--release=../../x",), ("--year=2020",)])
-def test_bad_options_of_electricity_maps(
-    run: Callable[..., Result], options: tuple[str, ...]
-) -> None:
-    assert "expected" in error(run(None, *MAPS, *options))
 
 
 # Generation

@@ -8,10 +8,8 @@ import re
 import zipfile
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
-import yaml
 
 pytestmark = pytest.mark.repo
 
@@ -25,13 +23,6 @@ def load(path: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def load_project() -> dict[str, Any]:
-    import tomllib
-
-    found: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    return found
 
 
 def release(root: Path, **changed: str) -> Path:
@@ -98,13 +89,3 @@ def test_sites_of_versions_stand_side_by_side(tmp_path: Path) -> None:
     assert 'url=0.10.0/"' in (pages / "index.html").read_text()
     with pytest.raises(SystemExit, match="expected dev or a version"):
         put(pages, build, "../dev", address)
-
-
-def test_the_recipe_requires_what_the_package_requires() -> None:
-    recipe = yaml.safe_load((ROOT / ".ci" / "recipe.yaml").read_text("utf-8"))
-    project = load_project()
-    run = [x.replace(" ", "") for x in recipe["requirements"]["run"] if not x.startswith("python ")]
-    assert sorted(run) == sorted(project["dependencies"])
-    assert recipe["context"]["version"] == project["version"].partition(".dev")[0]
-    ((name, target),) = project["scripts"].items()
-    assert recipe["build"]["python"]["entry_points"] == [f"{name} = {target}"]

@@ -212,19 +212,6 @@ def test_rows_of_the_transparency_platform(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-def test_hours_that_clocks_skip_are_left_out(tmp_path: Path) -> None:
-    (path,) = entsoe_wide(tmp_path, "MTU (CET/CEST)", "CET/CEST")
-    lines = path.read_text("utf-8").splitlines()
-    at = next(i for i, line in enumerate(lines) if "27.03.2022 03:00 - " in line)
-    skipped = "BZN|DE-LU,27.03.2022 02:00 - 27.03.2022 03:00,n/e,{},-,-,-,-"
-    path.write_text("\n".join([*lines[:at], skipped.format("-"), *lines[at:]]) + "\n", "utf-8")
-    expected = expected_intensity(tmp_path, "start")
-    np.testing.assert_allclose(imported([path], "entsoe", tmp_path / "u"), expected, atol=2e-3)
-    path.write_text("\n".join([*lines[:at], skipped.format("5"), *lines[at:]]) + "\n", "utf-8")
-    with pytest.raises(DataError, match=rf"row {at + 1}, .*an hour that clocks do not skip"):
-        imported([path], "entsoe", tmp_path / "user")
-
-
 def test_years_of_electricity_maps_are_joined(tmp_path: Path) -> None:
     paths = electricity_maps(tmp_path)
     item = import_saved_tables(
@@ -302,14 +289,6 @@ def test_areas(service: str, area: str | None, message: str, tmp_path: Path) -> 
     paths = MADE.get(service, entsoe_wide)(tmp_path)
     with pytest.raises(DataError, match=message.replace("|", r"\|")):
         imported(paths, service, tmp_path / "user", area)
-
-
-def test_a_half_year_alone_is_too_short(tmp_path: Path) -> None:
-    paths = eia_files(tmp_path)
-    with pytest.raises(DataError, match=r"expected at least 8760 \(365 days\)"):
-        imported(paths[:1], "eia-930", tmp_path / "user", "CISO")
-    with pytest.raises(DataError, match="comes twice"):
-        imported([paths[0], paths[0]], "eia-930", tmp_path / "user", "CISO")
 
 
 def test_months_of_watttime_are_joined(tmp_path: Path) -> None:

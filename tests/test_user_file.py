@@ -18,7 +18,7 @@ from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.sim import snapshot
-from sdc_taichi.user_file import decoding, open_input, read_text
+from sdc_taichi.user_file import decoding, open_input
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "weather.epw": read_epw,
@@ -75,12 +75,6 @@ def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> 
         file.writestr("soc.npy", b"\x93NUMPY\x02\x00" + (1 << 30).to_bytes(4, "little"))
     with pytest.raises(SdcError, match=r"state\.npz: cannot be read as array soc"):
         snapshot.read(path)
-
-
-def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_bytes(b"\xef\xbb\xbfa: 1")
-    assert read_text(path, 100) == "a: 1"
 
 
 def test_errors_are_of_one_class_and_keep_their_cause(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -105,7 +106,8 @@ def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -
     Units are in the keys; lists per rack are in the order of the racks, row by row.
     """
     inner, outer = _row_means(config, solution.approach_k)
-    figures = {name: x for name, x in solution._asdict().items() if isinstance(x, int | float)}
+    values = {each.name: getattr(solution, each.name) for each in fields(solution)}
+    figures = {name: value for name, value in values.items() if isinstance(value, int | float)}
     return {
         **figures,
         "approach_mean_k": float(solution.approach_k.mean()),
