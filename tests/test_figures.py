@@ -1,18 +1,18 @@
-"""Dashboards, fleet and data pictures, and the animation show what the steps hold."""
+"""Pictures show what the steps hold."""
 
 from __future__ import annotations
 
-import itertools
+import subprocess
+import sys
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pytest
 
-from sdc_taichi import SdcError, Simulator, StepResult, load_config
-from sdc_taichi.config import EventKind
+from sdc_taichi import SdcError, Simulator, StepResult, build_fleet, load_config
 from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.exogenous.synthetic import synthetic_site
 from sdc_taichi.run.metrics import Metric
@@ -92,9 +92,6 @@ def test_step_at_finds_the_step_of_a_time(run: Run) -> None:
 def test_times_that_are_not_in_the_run(run: Run, when: str, message: str) -> None:
     with pytest.raises(SdcError, match=message):
         figures.step_at(run[1], run[0], when)
-
-
-def test_no_steps_at_all(run: Run) -> None:
     with pytest.raises(SdcError, match="there are no steps"):
         figures.step_at([], run[0], "02-28 12:00")
 
@@ -170,27 +167,6 @@ def test_day_puts_effects_after_their_causes(steps: pd.DataFrame) -> None:
     np.testing.assert_array_equal(queue.get_ydata(), steps["queue_tasks"][95:192])
 
 
-def test_equal_commands_are_all_seen(steps: pd.DataFrame) -> None:
-    same = {f"{agent}_command": 0.0 for agent in ("load", "cooling", "battery")}
-    commands: Any = dashboards.day(steps.assign(**same), "02-28").axes[3]
-    widths = [line.get_linewidth() for line in commands.lines]
-    assert sorted(widths, reverse=True) == widths
-    assert min(-np.diff(widths)) > 1.0
-
-
-def test_events_of_each_kind_look_different(steps: pd.DataFrame) -> None:
-    kinds = [kind for kind in get_args(EventKind) if kind != "grid_outage"]
-    events = [{"kind": kind, "start_step": 100, "end_step": 110} for kind in kinds]
-    temperatures: Any = dashboards.day(steps, "02-28", events=events).axes[0]
-    looks = {(patch.get_facecolor(), patch.get_hatch()) for patch in temperatures.patches}
-    assert len(looks) == len(temperatures.patches) == len(kinds) == len(dashboards.EVENT_SHADES)
-
-
-def test_day_of_hottest_inlet(steps: pd.DataFrame) -> None:
-    hottest = steps["time"].iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
-    assert dashboards.hottest_day(steps) == hottest.strftime("%Y-%m-%d")
-
-
 def test_day_of_the_second_year(steps: pd.DataFrame) -> None:
     hottest_c = steps["inlet_max_c"].max() + 10.0
     later = steps["time"][:96] + pd.Timedelta(days=365)
@@ -255,30 +231,6 @@ def test_year_sums_months_of_long_runs() -> None:
         dashboards.year(steps[:47])
 
 
-@pytest.mark.parametrize(
-    ("begin", "days", "names", "span"),
-    [
-        (
-            "2001-07-15", 365, "Jul Aug Sep Oct Nov Dec Jan Feb Mar Apr May Jun Jul",
-            "15 July to 14 July",
-        ),
-        (
-            "2001-07-15", 600, "Jul Sep Nov Jan Mar May Jul Sep Nov Jan Mar",
-            "15 July (year 1) to 6 March (year 3)",
-        ),
-        ("2001-07-01", 31, "01 04 07 10 13 16 19 22 25 28 31", "1 July to 31 July"),
-    ],
-)  # fmt: skip
-def test_bars_have_names_that_fit(begin: str, days: int, names: str, span: str) -> None:
-    figure: Any = dashboards.year(hourly(begin, days))
-    energy = figure.axes[6]
-    assert [tick.get_text() for tick in energy.get_xticklabels()] == names.split()
-    assert energy.get_xlabel().endswith(f", {span}")
-    render(figure)
-    boxes = [tick.get_window_extent() for tick in energy.get_xticklabels()]
-    assert all(one.x1 < other.x0 for one, other in itertools.pairwise(boxes))
-
-
 def test_scatter_shows_every_step(steps: pd.DataFrame) -> None:
     figure: Any = dashboards.setpoint_scatter(steps, "ny")
     setpoint, share, inlet = (axes.collections[0] for axes in figure.axes[:3])
@@ -291,7 +243,7 @@ def test_scatter_shows_every_step(steps: pd.DataFrame) -> None:
     assert inlet.get_array().max() == steps["inlet_max_c"].max()
     assert [axes.get_xlabel() for axes in figure.axes[3:]] == [
         "setpoint (°C)",
-        "HVAC over IT power (%)",
+        "HVAC / IT power (%)",
         "hottest inlet (°C)",
     ]
     many = pd.concat(
@@ -402,7 +354,72 @@ def test_fleet_overview_fits_the_size(steps: pd.DataFrame, factor: float, power:
     assert clock(inlets.get_xlim()[1]) == "03-02 00:00"
 
 
-def test_tables_that_are_no_run(steps: pd.DataFrame) -> None:
+@pytest.mark.parametrize(("name", "rack"), [("inlet", 0), ("outlet", 1)])
+def test_hall_map_shows_the_racks(run: Run, name: str, rack: int) -> None:
+    fleet, results = run
+    figure: Any = figures.hall_map(results[40], fleet)
+    values = getattr(results[40], f"rack_{name}_c")
+    axes, bar = figure.axes[rack], figure.axes[2 + rack]
+    np.testing.assert_array_equal(axes.collections[0].get_array().ravel(), values)
+    assert bar.get_ylabel() == f"{name} (°C)"
+    assert axes.yaxis_inverted(), "row 0 at the top, as in recordings"
+    assert [text.get_text() for text in axes.texts] == [f"{v:.1f}" for v in values]
+    row, place = divmod(int(values.argmax()), fleet.configs[0].hall.racks_per_row)
+    title = axes.get_title(loc="left")
+    assert f"hottest {values.max():.1f} °C, row {row} rack {place}" in title
+    outlined = [(round(p.get_x() - 0.04), round(p.get_y() - 0.04)) for p in axes.patches]
+    assert (place, row) in outlined
+    assert render(figure).std() > 10
+
+
+def test_overview_shows_the_run(steps: pd.DataFrame) -> None:
+    figure: Any = figures.overview(steps)
+    weather, power, carbon, storage, emitted, charge = figure.axes
+    for line, name in zip(weather.lines, ("outdoor_c", "wet_bulb_c", "setpoint_c"), strict=True):
+        np.testing.assert_array_equal(line.get_ydata()[:-1], steps[name])
+    np.testing.assert_array_equal(carbon.lines[0].get_ydata()[:-1], steps["ci_g_per_kwh"])
+    np.testing.assert_array_equal(storage.lines[0].get_ydata(), steps["queue_tasks"])
+
+    def highest(axes: Any) -> float:
+        return max(float(a.get_paths()[0].vertices[:, 1].max()) for a in axes.collections)
+
+    assert highest(power) == pytest.approx(((steps["it_w"] + steps["hvac_w"]) / 1e3).max())
+    assert highest(emitted) == pytest.approx(steps["carbon_g"].max() / 1e3 / 0.25)
+    assert highest(charge) == pytest.approx(100 * steps["soc"].max())
+    assert not power.lines
+    # Presets may leave devices out of the total.
+    partly = steps.assign(overhead_w=steps["chiller_w"])
+    (line,) = figures.overview(partly).axes[1].lines
+    np.testing.assert_allclose(
+        np.asarray(line.get_ydata())[:-1], (steps["it_w"] + steps["chiller_w"]) / 1e3
+    )
+
+
+def test_missing_matplotlib_is_explained(
+    steps: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(SdcError, match=r'pip install "sdc-taichi\[plot\]"'):
+        figures.overview(steps)
+
+
+def test_import_is_light() -> None:
+    code = (
+        "import sys, sdc_taichi.viz.recorder, sdc_taichi.viz.figures;"
+        "print({'rerun', 'matplotlib', 'pandas', 'taichi'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_tables_that_are_no_run(run: Run, steps: pd.DataFrame) -> None:
+    fleet, results = run
+    with pytest.raises(SdcError, match=r"data center 1: valid is 0\.\.0"):
+        figures.hall_map(results[0], fleet, 1)
+    with pytest.raises(SdcError, match="result of 20 racks, expected 4"):
+        figures.hall_map(results[0], build_fleet(load_config("tiny")))
+    with pytest.raises(SdcError, match="1 rows; valid are two or more"):
+        figures.overview(steps[:1])
     with pytest.raises(SdcError, match="missing columns soc"):
         dashboards.battery_profile(steps.drop(columns="soc"))
     with pytest.raises(SdcError, match="missing columns load_command"):
@@ -476,11 +493,6 @@ def test_every_length_has_ticks(steps: int) -> None:
     figure: Any = data_figures.comparison(series, data_figures.CARBON)
     render(figure)
     assert 2 <= len(figure.axes[0].get_xticks()) <= 11
-
-
-def test_lines_differ() -> None:
-    styles = [tuple(plotting.line_style(i).items()) for i in range(32)]
-    assert len(set(styles)) == 32
 
 
 def hourly_carbon(site: str) -> pd.Series:

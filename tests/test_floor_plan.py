@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sdc_taichi import SdcError, load_config
+from sdc_taichi import load_config
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
 
@@ -132,15 +131,3 @@ def test_units_stand_outside_their_wall(drawn: tuple[DesignHall, Any, Any]) -> N
     for wall in (0, 1):
         mine = boxes[wall::2, :, 1]
         assert np.all(mine[1:].min(axis=1) >= mine[:-1].max(axis=1))
-
-
-def test_a_config_draws_as_its_description_does() -> None:
-    config = load_config("tiny")
-    figure = floor_plan_figure(config)
-    np.testing.assert_array_equal(racks_of(figure).get_array(), solve_design_hall(config).inlet_c)
-
-
-def test_missing_matplotlib_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(SdcError, match=r'pip install "sdc-taichi\[plot\]"'):
-        floor_plan_figure(load_config("tiny"))

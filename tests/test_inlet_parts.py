@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from rrd import read
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.control import make_controller
@@ -26,8 +25,6 @@ from sdc_taichi.run.steps_file import METADATA_KEY, AirAtStep
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
-from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.recording_text import hottest_markdown
 from sdc_taichi.viz.report import hot_racks_section
 
 FAILURES = (
@@ -182,33 +179,14 @@ def test_report_explains_the_five_hottest_racks(run: RunFolder) -> None:
     assert text.count("<tr>") == 2 * 5 + 2
 
 
-def test_recording_explains_the_five_hottest_racks(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    path = tmp_path / "hall.rrd"
-    with Simulator(load_config("corrected")) as sim, Recorder(path) as recorder:
-        recorder.begin(sim)
-        sim.reset()
-        recorder.add(sim.step())
-        inlets = Inlets(sim.fleet, 0, sim.intake_air())
-    (name,) = (name for name in read(path) if name.endswith("/hottest"))
-    ((text,),) = read(path)[name]["TextDocument:text"]
-    for rack in inlets.hottest(5):
-        assert f"## {rack_text(rack, 5)}: {inlets.parts(rack).inlet_c:.2f} C" in text
-    assert text.count("its own exhaust") == 5
-
-
 def test_given_inlets_are_explained_by_their_approach_temperatures(tmp_path: Path) -> None:
     with Simulator(load_config("tiny")) as sim:
         controller = make_controller("idle", sim.fleet)
         simulate_to_folder(sim, controller, RunRequest("idle", 2, 1), tmp_path / "run")
-        air = AirAtStep(1, intake_air_of(sim.fleet, sim.intake_air(), 0))
-        document = hottest_markdown(sim.fleet, 0, air, "2021-01-01T00:15")
     report = hot_racks_section(read_run(tmp_path / "run"), [0])
     assert "approach temperature (K)" in report
     assert "exhaust of other racks" not in report
-    assert "+5.40 K | approach temperature of the config" in document
-    for text in (report, document):
-        assert "is exhaust air" not in text
+    assert "is exhaust air" not in report
 
 
 def why(*arguments: object) -> str:

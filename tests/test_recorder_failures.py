@@ -140,44 +140,6 @@ main()
 
 
 @POSIX
-def test_full_disk_leaves_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    if mounted.returncode:
-        pytest.skip("a small file system cannot be mounted here")
-    try:
-        with monkeypatch.context() as patch:
-            patch.chdir(disk)
-            done = invoke("simulate", "tiny", "--days", "31", "--out", "run", "--quiet",
-                "--record", "run/x.rrd")  # fmt: skip
-        assert done.exit_code == 0, done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
-        assert "kept for the results of the run; the run goes on" in done.stderr
-        assert len(pd.read_parquet(disk / "run/steps.parquet")) == 2976
-        found = recorded_steps(disk / "run/x.rrd")
-        assert found == list(range(len(found)))
-        assert 0 < len(found) < 2976
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
-def test_file_that_becomes_a_folder_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "x.rrd"
-    with small() as sim:
-        rec = Recorder(path)
-        sim.reset()
-        rec.begin(sim)
-        rec.add(sim.step())
-        path.mkdir()
-        with pytest.warns(RecordingWarning, match=r"x\.rrd: cannot be opened"):
-            rec.close()
-
-
 # Viewers
 
 

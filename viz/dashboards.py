@@ -40,6 +40,7 @@ from .plotting import (
     literal_text,
     new_figure,
     outline_hottest,
+    remove_frame,
     rows_of_day,
     scale_thousands,
     short_name,
@@ -79,9 +80,9 @@ CARPETS = (
 ENERGY_COLUMNS = ("it_kwh", "hvac_kwh", "carbon_g")
 """Columns of which ``year`` shows sums by month or day."""
 MAX_SCATTER_POINTS = 6_000
-"""Largest number of points of a scatter; of longer runs so many steps are drawn by lot."""
+"""Largest number of points of a scatter; of longer runs a random choice of steps is drawn."""
 MAX_NAMED_BARS = 13
-"""Largest number of bars with a name below."""
+"""Largest number of bars that are labelled."""
 EVENT_SHADES = {
     "crac_down": (BLUE, "//"),
     "chiller_derate": (GREEN, "\\\\"),
@@ -136,7 +137,7 @@ def hottest_day(steps: pd.DataFrame) -> str:
 
 
 def year(steps: pd.DataFrame, title: str = "") -> Figure:
-    """A run of two days to years: what each hour of each day was like, and monthly totals.
+    """A run of two days to years: maps of its values by day and hour, and monthly totals.
 
     Args:
         steps: steps of the data center.
@@ -167,10 +168,10 @@ def year(steps: pd.DataFrame, title: str = "") -> Figure:
 
 
 def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
-    """Which setpoint was used at which weather and load, and what it cost and did.
+    """Setpoint, relative HVAC power and hottest inlet of each step, by weather and load.
 
-    Every point is a step, at its outdoor temperature and IT power; three panels colour it by the
-    setpoint, by HVAC power over IT power and by the hottest inlet.
+    A point is a step at its outdoor temperature and IT power. Three panels colour it by the
+    setpoint, by the ratio of HVAC to IT power, and by the hottest inlet.
 
     Args:
         steps: steps of the data center.
@@ -188,7 +189,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
     for axes, values, label, cmap in zip(
         figure.subplots(1, 3, sharex=True, sharey=True),
         (shown["setpoint_c"], share, shown["inlet_max_c"]),
-        ("setpoint (°C)", "HVAC over IT power (%)", "hottest inlet (°C)"),
+        ("setpoint (°C)", "HVAC / IT power (%)", "hottest inlet (°C)"),
         ("viridis", "cividis", "inferno"),
         strict=True,
     ):
@@ -202,8 +203,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
         )
         figure.colorbar(marks, ax=axes, label=label, orientation="horizontal", shrink=0.9)
         axes.set_xlabel("outdoor (°C)")
-        axes.spines[:].set_visible(False)
-        axes.grid(alpha=0.25)
+        remove_frame(axes)
         if axes.get_subplotspec().is_first_col():
             axes.set_ylabel("IT power (kW)")
     add_title(figure, short_name(title))
@@ -252,7 +252,7 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
 
 
 def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
-    """Where the hall ran hot: how long each rack had the hottest inlet, and its highest inlet.
+    """Hours in which each rack had the hottest inlet of the hall, and its highest inlet.
 
     Racks that are equally hot, up to ``TIE_K``, all have the hottest inlet.
 
@@ -325,25 +325,21 @@ def _disturbances(
     steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> list[tuple[npt.NDArray[np.bool_], str, str, str]]:
     """Disturbances of the run: mask over the steps, colour, hatching and label of each."""
-    found = [
+    shades = [
         ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
         ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),
         ((steps["grid_up"] < 1).to_numpy(), PINK, "", "grid down"),
     ]
-    if not events:
-        return found
-    step = steps["step"].to_numpy()
-    for kind in dict.fromkeys(str(event["kind"]) for event in events):
-        if kind == "grid_outage":
-            continue
-        lasts = [
-            (step >= event["start_step"]) & (step < event["end_step"])
-            for event in events
-            if event["kind"] == kind
-        ]
-        colour, hatch = EVENT_SHADES.get(kind, (GREY, ""))
-        found.append((np.any(lasts, axis=0), colour, hatch, kind.replace("_", " ")))
-    return found
+    masks: dict[str, npt.NDArray[np.bool_]] = {}
+    for event in events:
+        if event["kind"] != "grid_outage":
+            step = steps["step"].to_numpy()
+            lasts = (step >= event["start_step"]) & (step < event["end_step"])
+            masks[event["kind"]] = masks.get(event["kind"], False) | lasts
+    return shades + [
+        (mask, *EVENT_SHADES.get(kind, (GREY, "")), kind.replace("_", " "))
+        for kind, mask in masks.items()
+    ]
 
 
 def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:

@@ -25,6 +25,7 @@ from .plotting import (
     line_style,
     literal_text,
     new_figure,
+    remove_frame,
     style_axes,
 )
 
@@ -124,8 +125,7 @@ def carbon_variation(series: Mapping[str, pd.Series], title: str = "") -> Figure
     axes.set_ylim(bottom=0)
     axes.set_xlabel("variation within the day: standard deviation over mean, mean of the days (%)")
     axes.set_ylabel("mean carbon intensity (g CO₂e/kWh)")
-    axes.spines[:].set_visible(False)
-    axes.grid(alpha=0.25)
+    remove_frame(axes)
     add_title(figure, title)
     return figure
 
@@ -185,13 +185,11 @@ def draw_year(series: tuple[Series, ...], title: str) -> Figure:
         title: title of the figure.
 
     Raises:
-        ImportError: matplotlib is missing.
+        SdcError: matplotlib is missing.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), dpi=120, layout="constrained")
-    written = printable(title).replace("$", r"\$")
-    figure.suptitle(f"{written} (synthetic)" if any(s.synthetic for s in series) else written)
+    figure = new_figure(10.0, 1.0 + 1.9 * len(series))
+    synthetic = " (synthetic)" * any(s.synthetic for s in series)
+    add_title(figure, printable(title) + synthetic)
     axes = figure.subplots(len(series), 2, squeeze=False, width_ratios=(3, 1))
     for (year, day), s in zip(axes, series, strict=True):
         hourly = resample(s, 1)[:HOURS_PER_YEAR].reshape(DAYS_PER_YEAR, 24)

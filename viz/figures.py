@@ -76,7 +76,7 @@ def step_at(results: Iterable[StepResult], fleet: Fleet, when: str, dc: int = 0)
     """The first of some steps that covers a time of the data center's clock.
 
     Args:
-        results: steps in order, such as a list or what a loop yields; read up to the one found.
+        results: steps in order, such as a list or a generator; read up to the step in question.
         fleet: the fleet they belong to.
         when: ``MM-DD HH:MM``, local standard time.
         dc: index of the data center.
@@ -86,15 +86,18 @@ def step_at(results: Iterable[StepResult], fleet: Fleet, when: str, dc: int = 0)
     """
     if re.fullmatch(r"\d\d-\d\d \d\d:\d\d", when) is None:
         raise SdcError(f"time {when!r}: valid is MM-DD HH:MM, for example 07-01 15:00")
-    found: list[str] = []
+    begins: list[str] = []
     for result in results:
         begin = step_time(result, fleet, dc).astype(datetime)
-        found = [*found[:1], f"{begin:%m-%d %H:%M}"]
+        begins = [*begins[:1], f"{begin:%m-%d %H:%M}"]
         minutes = (int(when[6:8]) - begin.hour) * 60 + int(when[9:]) - begin.minute
         if when[:5] == f"{begin:%m-%d}" and 0 <= minutes < 60 * result.step_h:
             return result
-    span = f"the steps are those from {found[0]} to {found[-1]}" if found else "there are no steps"
-    raise SdcError(f"time {when!r}: no step covers it; {span}")
+    if not begins:
+        raise SdcError(f"time {when!r}: no step covers it; there are no steps")
+    raise SdcError(
+        f"time {when!r}: no step covers it; the steps are those from {begins[0]} to {begins[-1]}"
+    )
 
 
 def overview(steps: pd.DataFrame) -> Figure:
@@ -121,12 +124,12 @@ def step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
     """Time at which a step begins on the clock of a data center, as in steps.parquet."""
     day = day_of_year(fleet.configs[dc].site.start)
     start = np.array([day * 24 * fleet.steps_per_hour])
-    found = step_times(start, np.array([result.step]), fleet.steps_per_hour)
-    return np.datetime64(found[0, 0], "s")
+    times = step_times(start, np.array([result.step]), fleet.steps_per_hour)
+    return np.datetime64(times[0, 0], "s")
 
 
 def check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
-    """Refuse a result that is none of the fleet, or an index that the fleet does not have."""
+    """Check that a result belongs to the fleet, and that the fleet has the index."""
     if not 0 <= dc < fleet.size:
         raise SdcError(f"data center {dc}: valid is 0..{fleet.size - 1}")
     if len(result.rack_inlet_c) != fleet.racks:
@@ -262,7 +265,7 @@ IDLE = "idle"
 def optimum_day(
     steps_of: Mapping[str, pd.DataFrame], date: str, title: str = "", *, by_price: bool = False
 ) -> Figure:
-    """What grid, load, setpoint and battery do over a day under each of some controllers.
+    """Grid, load, setpoint and battery over one day, under each of several controllers.
 
     Args:
         steps_of: steps of one data center under each controller, by label.

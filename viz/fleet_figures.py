@@ -26,7 +26,6 @@ from .plotting import (
     line_style,
     literal_text,
     new_figure,
-    place_radar_labels,
     repeat_last,
     scale_thousands,
     step_edges,
@@ -97,7 +96,9 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
     ]
     axes.set_xticks(angle, labels, fontsize=9)
     axes.tick_params(axis="x", pad=6)
-    place_radar_labels(axes, angle)
+    for text, side in zip(axes.get_xticklabels(), np.sin(angle), strict=True):
+        text.set_horizontalalignment("left" if side > 0.1 else "right" if side < -0.1 else "center")
+        text.set_verticalalignment("center" if abs(side) > 0.1 else "bottom")
     axes.spines["polar"].set_color(GREY)
     figure.legend(loc="upper right", frameon=False, title="less is better")
     return figure
@@ -156,7 +157,7 @@ def fleet_overview(steps: pd.DataFrame) -> Figure:
 
 
 def fleet_map(edges: npt.NDArray[np.datetime64], inlet_max_c: F64, names: Sequence[str]) -> Figure:
-    """Which halls run hot, and when: the hottest inlet of each data center over time.
+    """Map of the hottest inlet of each data center over time.
 
     The hottest data centers stand above, ``MAX_MAP_ROWS`` at most.
 

@@ -1,17 +1,16 @@
-"""Halls as heat maps and as voxels: which pixels and which voxels show which rack or server."""
+"""Heat maps and voxels of halls: the pixels of each rack, and the voxels of its levels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
+from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F32, F64, I64, Reals
+from sdc_taichi.types import F32, I64, Reals
 
 TEMPERATURE_RESOLUTION_K = 1 / 16
 """Resolution of temperatures: exact in half precision below 64 C, and it compresses well."""
@@ -198,78 +197,14 @@ def rack_voxels(hall: HallConfig, levels: int) -> RackVoxels:
     )
 
 
-def room_outline_m(plan: FloorPlan, height_m: float) -> list[list[tuple[float, float, float]]]:
-    """Lines around the floor and the ceiling of a room, as points in m."""
-    corners = [(0.0, 0.0), (plan.length_m, 0.0), (plan.length_m, plan.width_m), (0.0, plan.width_m)]
-    return [[(x, y, z) for x, y in (*corners, corners[0])] for z in (0.0, height_m)]
-
-
-class LevelGroups(NamedTuple):
-    """Server groups behind each level of the racks of some data centers."""
-
-    groups: I64
-    """Server groups in each level, counted over the groups of these data centers, level by level
-    from the floor up, rack by rack, (N,)."""
-    offsets: I64
-    """Where the groups of each level begin in ``groups``, (levels of all racks,)."""
-
-
-def level_groups(fleet: Fleet, dcs: Sequence[int], levels: Sequence[int]) -> LevelGroups:
-    """Server groups behind each level of the racks of some data centers.
+def level_starts(servers: I64, levels: int) -> I64:
+    """First server of each level of racks, counted over the servers of all of them, (R levels,).
 
     Args:
-        fleet: the fleet.
-        dcs: indices of the data centers.
-        levels: levels per rack of each of these; racks have at least as many servers.
+        servers: number of servers of each rack, (R,), at least one per level.
+        levels: number of equal heights that a rack is cut into.
     """
-    groups: list[I64] = []
-    offsets: list[I64] = []
-    groups_before = 0
-    for dc, count in zip(dcs, levels, strict=True):
-        racks = np.arange(*fleet.rack_offsets[dc : dc + 2])
-        first_group, end_group = fleet.group_offsets[fleet.rack_offsets[dc : dc + 2]].tolist()
-        first_servers = fleet.server_offsets[first_group:end_group]
-        first = fleet.server_offsets[fleet.group_offsets[racks]].astype(np.int64)
-        servers = fleet.server_offsets[fleet.group_offsets[racks + 1]] - first
-        # Server j of n is in level j * levels // n.
-        below = (np.arange(count) * servers[:, None] + count - 1) // count
-        level_first = (first[:, None] + below).reshape(-1)
-        # A level shows the groups that begin in it, and the one that its first server is of.
-        begins = np.union1d(level_first, first_servers)
-        offsets.append(np.searchsorted(begins, level_first) + sum(map(len, groups)))
-        groups.append(np.searchsorted(first_servers, begins, side="right") - 1 + groups_before)
-        groups_before += len(first_servers)
-    return LevelGroups(np.concatenate(groups), np.concatenate(offsets))
-
-
-def level_maxima(group_values: F32, levels: LevelGroups) -> F32:
-    """Highest value in each level.
-
-    Args:
-        group_values: values of the server groups, (..., G).
-        levels: groups behind the levels.
-
-    Returns:
-        Values of the levels, (..., levels of all racks).
-    """
-    by_level = group_values[..., levels.groups]
-    if len(levels.offsets) == len(levels.groups):
-        return by_level
-    return np.asarray(np.maximum.reduceat(by_level, levels.offsets, axis=-1))
-
-
-def crac_box_centres_m(places_m: F64, plan: FloorPlan, height_m: float) -> F64:
-    """Centres of boxes that stand for CRAC units, outside of the end walls.
-
-    Args:
-        places_m: places of the units on the walls, (U, 2), in m.
-        plan: floor plan of the hall.
-        height_m: height of the boxes, in m.
-
-    Returns:
-        Centres, (U, 3), in m.
-    """
-    outside = np.where(places_m[:, 0] > plan.length_m / 2, 0.5, -0.5)
-    return np.stack(
-        [places_m[:, 0] + outside, places_m[:, 1], np.full(len(places_m), height_m / 2)], axis=1
-    )
+    first = np.cumsum(servers) - servers
+    # Server j of n is in level j * levels // n.
+    below = (np.arange(levels) * servers[:, None] + levels - 1) // levels
+    return (first[:, None] + below).reshape(-1)

@@ -1,8 +1,8 @@
-"""Shared parts of all pictures: colours, figures, axes, and the words on them.
+"""Shared parts of all pictures: colours, figures, axes and texts.
 
 pyplot is not used, so no window or global state is touched. Colours are those of Okabe and Ito
 (2008), "Color Universal Design", and the maps inferno, viridis and cividis, which readers with
-colour vision deficiency can tell apart.
+colour vision deficiency can distinguish.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ DPI = 100
 MAX_LABELLED_RACKS = 60
 """Number of racks up to which the racks of a hall show their values as numbers."""
 MIN_COLOUR_RANGE_K = 2.0
-"""Least range of a colour bar, so that differences of a few tenths look small, in K."""
+"""Smallest range of a colour bar, in K, so that differences of a few tenths look small."""
 MAX_NAME_LENGTH = 50
 """Largest number of characters of a name in a picture."""
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"
 LINE_COLOURS = (BLUE, ORANGE, GREEN, RED, PINK, SKY, "black", "#B8A800")
-"""Colours of lines in the order in which they are taken; the yellow is darkened for white paper."""
+"""Colours of lines in their order of use; the yellow is darkened for white paper."""
 LINE_STYLES = ("-", "--", ":", "-.")
-"""Dashes of lines, changed when all colours are taken."""
+"""Dashes of lines, changed when all colours are used."""
 DAY = np.timedelta64(1, "D")
 """Length of a day."""
 
@@ -141,7 +141,7 @@ def date_text(moment: datetime, *, over_a_year: bool) -> str:
 
     Args:
         moment: the time.
-        over_a_year: whether the run is longer than a year; then its year is given too.
+        over_a_year: whether the run is longer than a year; then the text names the year too.
     """
     year = f" (year {moment.year - FIRST_YEAR + 1})" if over_a_year else ""
     return f"{moment.day} {moment:%B}{year}"
@@ -185,14 +185,15 @@ def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
     """
     days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
     names = [str(each) for each in days]
-    found = [i for i, name in enumerate(names) if date in (name, name[-5:])]
-    if not found:
+    days_of_date = [i for i, name in enumerate(names) if date in (name, name[-5:])]
+    if not days_of_date:
         raise SdcError(
             f"date {date!r}: valid is MM-DD of a day of the run, "
             f"{names[0][-5:]} to {names[-1][-5:]} ({len(days)} days)"
         )
     rows = [*map(int, first), len(steps)]
-    return rows[found[0]], rows[found[0] + 1]
+    first_day = days_of_date[0]
+    return rows[first_day], rows[first_day + 1]
 
 
 def step_edges(steps: pd.DataFrame) -> npt.NDArray[np.datetime64]:
@@ -297,11 +298,16 @@ def outline_hottest(axes: Axes, grid: F64) -> str:
     return place
 
 
+def remove_frame(axes: Axes) -> None:
+    """Give axes a grid in place of a frame."""
+    axes.spines[:].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
 def style_axes(axes: Axes) -> None:
     """Give axes a grid in place of a frame, and let curves run from edge to edge."""
     axes.margins(x=0)
-    axes.spines[:].set_visible(False)
-    axes.grid(alpha=0.25)
+    remove_frame(axes)
 
 
 def style_axes_with_legend(axes: Axes) -> None:
@@ -317,18 +323,6 @@ def style_axes_with_legend(axes: Axes) -> None:
         columnspacing=1.2,
         handlelength=1.2,
     )
-
-
-def place_radar_labels(axes: Any, angle: F64) -> None:
-    """Move the labels of a radar's axes outside its circle, which begins at the top and runs right.
-
-    Args:
-        axes: polar axes with their ticks.
-        angle: angle of each tick, in rad.
-    """
-    for text, side in zip(axes.get_xticklabels(), np.sin(angle), strict=True):
-        text.set_horizontalalignment("left" if side > 0.1 else "right" if side < -0.1 else "center")
-        text.set_verticalalignment("center" if abs(side) > 0.1 else "bottom")
 
 
 def format_time_axis(axes: Axes) -> None:

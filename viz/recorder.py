@@ -1,4 +1,4 @@
-"""Record what a simulator does for the Rerun viewer, while it does it."""
+"""Recorder of the steps of a simulator, for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAX_FOCUS, DEFAULT_FOCUS = 4, 2
 """Largest number of data centers in focus, and the number of those taken by default."""
 KEEP_BYTES, KEEP_BYTES_PER_VALUE, KEEP_BYTES_PER_DC = 8_000_000, 8, 20_000
-"""Room that a recording leaves for the run folder: in all, per value, and per data center."""
+"""Bytes that a recording leaves free for the run folder: in all, per value and data center."""
 
 
 class Recorder:
@@ -45,7 +45,7 @@ class Recorder:
         path_or_address: file to write, ending in .rrd, or the address of a running viewer such as
             rerun+http://127.0.0.1:9876/proxy; None with ``serve_port`` alone.
         focus: names of up to 4 data centers to record in full; None is the first 2. The others
-            count in the fleet series. Where names are not distinct, NAME#INDEX tells them apart.
+            count in the fleet series. Data centers of equal names are called NAME#INDEX.
         every: steps between two heat maps, and between two frames of the 3D hall; None follows the
             number of racks in focus. Series always have every step.
         serve_port: also let viewers connect to this port of 127.0.0.1; 0 picks a free one.
@@ -107,12 +107,12 @@ class Recorder:
         NAME-2.rrd and so on; nothing is written before there is a step.
 
         Args:
-            sim: the simulator whose steps ``add`` is given.
-            description: what ``describe_run`` says of the run; None is what the simulator knows.
+            sim: the simulator whose steps ``add`` takes.
+            description: result of ``describe_run``; None describes the simulator alone.
 
         Raises:
-            SdcError: a name in focus that there is not, a file that cannot be written or that
-                another process records to, or too little room on its disk.
+            SdcError: an unknown name in focus, a file that cannot be written or that another
+                process records to, or too little room on its disk.
         """
         self.close()
         self._episodes += 1
@@ -152,8 +152,8 @@ class Recorder:
             rewards: reward terms by name, each (B,); of every step or of none.
 
         Raises:
-            SdcError: there is no episode, or the step is none of its simulator's, or does not
-                follow the step before.
+            SdcError: there is no episode, the step is of another simulator, or it does not follow
+                the step before.
         """
         if self._writer is None:
             raise SdcError("recorder: begin(sim) comes before the first step")
@@ -165,7 +165,7 @@ class Recorder:
             self._writer.flush()
 
     def close(self) -> None:
-        """Write what is left; closing again does nothing."""
+        """Write the remaining steps; closing again does nothing."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -187,7 +187,7 @@ def distinct_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_focus(focus: Sequence[str]) -> tuple[str, ...]:
-    """Check and return the names of the data centers in focus; one may be given as a text."""
+    """Check and return the names of the data centers in focus, a list or a single name."""
     names = (focus,) if isinstance(focus, str) else focus
     are_names = isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
     if not (are_names and 0 < len(names) <= MAX_FOCUS and len(set(names)) == len(names)):

@@ -1,6 +1,6 @@
 """Send a recording to a file, to a viewer, or to viewers that connect here.
 
-An output never stops or slows a simulation. The first failure is told in one warning and ends the
+An output never stops or slows a simulation. The first failure causes one warning and ends the
 output; a file then ends with the last block that was written whole.
 """
 
@@ -38,14 +38,12 @@ PROBE_S = 0.5
 FILE_BLOCK_S = 5.0
 """Longest time that a file system may take to write one block, in s."""
 MAX_UNSENT_BYTES = 256_000_000
-"""Bytes that may wait for a slow viewer; one with more is waited for once, and then given up."""
+"""Bytes that may wait for a slow viewer. With more, one last wait decides whether it hangs."""
 VIEWER_WAIT_S = 2.0
 """Longest wait for a viewer that is behind, and for Rerun to let go of an output, in s."""
 DELETE_EVERY = 8
 """Number of closed recordings that are deleted together; Rerun keeps four threads of each."""
-_PROMPT_VIEWER_S = 1e-3  # 0 would not tell whether a viewer keeps up
-_FOOTER = b"RRF2FOOT"
-_FOOTER_FROM_END = 12
+_PROMPT_VIEWER_S = 1e-3  # 0 would not show whether a viewer keeps up
 
 
 class RecordingWarning(SdcWarning):
@@ -59,7 +57,7 @@ def import_rerun() -> Any:
         SdcError: rerun-sdk is missing.
     """
     os.environ.setdefault("RERUN_ANALYTICS", "0")
-    # Read once, on import. Lost viewers and full disks are told by warnings of this module instead.
+    # Read once, on import. This module itself warns of lost viewers and full disks.
     silence = "RUST_LOG" not in os.environ
     if silence:
         os.environ["RUST_LOG"] = "off"
@@ -76,7 +74,7 @@ def import_rerun() -> Any:
 
 
 class RecordingOutput:
-    """The way of one recording to its file and its viewers.
+    """File and viewers of one recording.
 
     Args:
         file: file to write, or None.
@@ -191,7 +189,7 @@ class RecordingOutput:
         self._chunks.append(Chunk.from_columns(entity, times, columns))
 
     def send_static(self, entity: str, component: Any) -> None:
-        """Send a component that holds at all times."""
+        """Send a static component."""
         if self._stream is not None:
             self._stream.log(entity, component, static=True, strict=True)
 
@@ -202,7 +200,7 @@ class RecordingOutput:
             self._stream.send_chunks(chunks)
 
     def close(self) -> None:
-        """Write what is left, with the index of the file, and let others write the file."""
+        """Write the remaining blocks and the index, and let other processes write the file."""
         try:
             self._finish()
         finally:
@@ -210,7 +208,7 @@ class RecordingOutput:
                 self._claim.release()
 
     def _finish(self) -> None:
-        """Write what is left, with the index of the file."""
+        """Write the remaining blocks and the index of the file."""
         if self._stream is None or self.failed:
             return
         self._confirm_sent(VIEWER_WAIT_S)
@@ -221,12 +219,9 @@ class RecordingOutput:
         self._stream.disconnect()
         self._stream = None
         _delete_closed_recordings()
-        if self._file is not None and not _has_index(self._file):
-            self._truncate_to_whole_blocks()
-            self._warn("its index could not be written")
 
     def _confirm_sent(self, viewer_s: float = _PROMPT_VIEWER_S) -> None:
-        """Find out whether what was sent has arrived; a file has ``FILE_BLOCK_S``.
+        """Find out whether all that was sent has arrived; a file has ``FILE_BLOCK_S`` for it.
 
         Args:
             viewer_s: time that a viewer has, in s.
@@ -323,10 +318,10 @@ _closed = itertools.count(1)
 
 
 def _delete_closed_recordings() -> None:
-    """Delete the closed recordings, while there are no others, whoever made them.
+    """Delete closed recordings from memory, unless this process has open ones.
 
-    Rerun would write open ones out first, wait for ever for one that hangs, and log to no other
-    than the global one any more.
+    With open ones, Rerun would first write them out, wait for ever for one that hangs, and then log
+    only to the global one.
     """
     import rerun as rr
 
@@ -338,13 +333,13 @@ def _delete_closed_recordings() -> None:
 
 
 class _BackgroundCall(threading.Thread):
-    """A call in a thread of its own, because it may never return.
+    """Call in a separate thread, because it may never return.
 
-    A flush of Rerun's may not, whatever its timeout, once writing has failed.
+    Once writing has failed, a flush of Rerun may not return, whatever its timeout.
 
     Args:
         call: the function.
-        arguments: given to the function.
+        arguments: arguments of the function.
     """
 
     def __init__(self, call: Callable[..., object], *arguments: object) -> None:
@@ -395,16 +390,6 @@ def _check_room(file: Path, keep_bytes: int) -> None:
             f"{file}: {free / 1e6:.1f} MB left on the disk, expected {keep_bytes / 1e6:.1f} MB for "
             "the results of the run besides the recording"
         )
-
-
-def _has_index(file: Path) -> bool:
-    """Whether a recording ends with the index that Rerun writes last."""
-    try:
-        with file.open("rb") as opened:
-            opened.seek(-_FOOTER_FROM_END, os.SEEK_END)
-            return opened.read(len(_FOOTER)) == _FOOTER
-    except OSError:
-        return False
 
 
 def is_address(target: object) -> TypeGuard[str]:

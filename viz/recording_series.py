@@ -1,21 +1,20 @@
-"""Plots of a recording: which fields of ``StepResult`` they show, with names and colours."""
+"""Series of a recording: the quantities of ``StepResult`` that it holds, and their plots."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, QUANTITIES
 
 # Colours of Okabe and Ito, which stay apart for people who are colour-blind (Okabe, Ito: Color
 # Universal Design, 2008). Black is a grey here, since the viewer's ground is dark.
 BLUE, ORANGE, GREEN, RED = 0x0072B2FF, 0xE69F00FF, 0x009E73FF, 0xD55E00FF
 PINK, SKY, YELLOW, GREY = 0xCC79A7FF, 0x56B4E9FF, 0xF0E442FF, 0x999999FF
 PALETTE = (BLUE, ORANGE, GREEN, RED, PINK, SKY, YELLOW, GREY)
-"""Colours in the order in which lines without a colour of their own take them, as 0xRRGGBBAA."""
+"""Colours of lines without a fixed colour, in their order of use, as 0xRRGGBBAA."""
 
 AGE_EDGES_H = (0.0, 6.0, 12.0, 24.0)
 """Lower edges of the age bands of the queue, in h; the last band has no upper edge."""
@@ -35,127 +34,109 @@ class Cadence:
     """Levels per rack of the 3D hall of each data center in focus."""
     has_servers: bool
     """Whether levels show servers; else a rack shows its hottest inlet and its mean outlet."""
-    block_steps: int
-    """Number of steps in a block."""
-
-
-class PlotLine(NamedTuple):
-    """One line of a plot."""
-
-    name: str
-    """Name in the legend, with the unit in brackets."""
-    field: str
-    """Field of ``StepResult`` that the line shows."""
-    colour: int
-    """Colour as 0xRRGGBBAA."""
-    factor: float = 1.0
-    """Unit of the field over the unit of the line; the field is multiplied by it."""
-    per_hour: bool = False
-    """Whether to divide by the length of the step in h, which turns energies into powers."""
 
 
 class Plot(NamedTuple):
     """Lines of one unit, which are one entity of the recording."""
 
     title: str
-    """Title of the plot, with the unit in brackets."""
-    lines: tuple[PlotLine, ...]
-    """Lines from first to last in the legend."""
+    """Title of the plot."""
+    unit: str
+    """Unit of the lines, which titles and names show in brackets."""
+    lines: tuple[tuple[str, str, int], ...]
+    """Name, quantity of ``StepResult`` and colour, as 0xRRGGBBAA, of each line of the legend."""
     limits: tuple[float, float] | None = None
-    """Ends of the vertical axis, in the unit of the lines; None follows the values."""
+    """Ends of the vertical axis; None follows the values."""
 
 
 PLOTS: dict[str, Plot] = {
     "temperature_c": Plot(
-        "air temperature [C]",
+        "air temperature",
+        "C",
         (
-            PlotLine("setpoint [C]", "setpoint_c", BLUE),
-            PlotLine("supply [C]", "supply_c", SKY),
-            PlotLine("inlet mean [C]", "inlet_mean_c", GREEN),
-            PlotLine("inlet hottest [C]", "inlet_max_c", ORANGE),
-            PlotLine("outlet mean [C]", "outlet_mean_c", PINK),
-            PlotLine("return [C]", "return_c", RED),
+            ("setpoint", "setpoint_c", BLUE),
+            ("supply", "supply_c", SKY),
+            ("inlet mean", "inlet_mean_c", GREEN),
+            ("inlet hottest", "inlet_max_c", ORANGE),
+            ("outlet mean", "outlet_mean_c", PINK),
+            ("return", "return_c", RED),
         ),
     ),
     "power_kw": Plot(
-        "power [kW]",
+        "power",
+        "kW",
         (
-            PlotLine("IT [kW]", "it_w", BLUE, 1e-3),
-            PlotLine("HVAC [kW]", "hvac_w", SKY, 1e-3),
-            PlotLine("UPS loss [kW]", "ups_loss_w", PINK, 1e-3),
-            PlotLine("distribution loss [kW]", "distribution_loss_w", GREY, 1e-3),
-            PlotLine("grid [kW]", "grid_kwh", ORANGE, per_hour=True),
-            PlotLine("battery charge [kW]", "charge_kwh", GREEN, per_hour=True),
-            PlotLine("battery discharge [kW]", "discharge_kwh", RED, per_hour=True),
+            ("IT", "it_w", BLUE),
+            ("HVAC", "hvac_w", SKY),
+            ("UPS loss", "ups_loss_w", PINK),
+            ("distribution loss", "distribution_loss_w", GREY),
+            ("grid", "grid_kwh", ORANGE),
+            ("battery charge", "charge_kwh", GREEN),
+            ("battery discharge", "discharge_kwh", RED),
         ),
     ),
     "carbon_intensity": Plot(
-        "grid carbon intensity [g/kWh]",
-        (PlotLine("grid carbon intensity [g/kWh]", "ci_g_per_kwh", RED),),
+        "grid carbon intensity", "g/kWh", (("grid carbon intensity", "ci_g_per_kwh", RED),)
     ),
-    "carbon_kg": Plot("carbon [kg/step]", (PlotLine("carbon [kg/step]", "carbon_g", RED, 1e-3),)),
-    "price": Plot(
-        "price of electricity [currency/kWh]",
-        (PlotLine("price [currency/kWh]", "price_per_kwh", GREEN),),
-    ),
+    "carbon_kg": Plot("carbon", "kg/step", (("carbon", "carbon_g", RED),)),
+    "price": Plot("price of electricity", "currency/kWh", (("price", "price_per_kwh", GREEN),)),
     "energy_cost": Plot(
-        "cost of energy [currency/step]",
-        (PlotLine("cost of energy [currency/step]", "energy_cost", GREEN),),
+        "cost of energy", "currency/step", (("cost of energy", "energy_cost", GREEN),)
     ),
-    "battery": Plot(
-        "battery state of charge [-]", (PlotLine("state of charge [-]", "soc", GREEN),), (0.0, 1.0)
-    ),
+    "battery": Plot("battery state of charge", "-", (("state of charge", "soc", GREEN),), (0, 1)),
     "hvac_kw": Plot(
-        "HVAC by device [kW]",
+        "HVAC by device",
+        "kW",
         (
-            PlotLine("chiller [kW]", "chiller_w", BLUE, 1e-3),
-            PlotLine("tower fan [kW]", "tower_fan_w", SKY, 1e-3),
-            PlotLine("chilled-water pump [kW]", "chilled_pump_w", GREEN, 1e-3),
-            PlotLine("condenser pump [kW]", "condenser_pump_w", PINK, 1e-3),
-            PlotLine("CRAC fan [kW]", "crac_fan_w", ORANGE, 1e-3),
+            ("chiller", "chiller_w", BLUE),
+            ("tower fan", "tower_fan_w", SKY),
+            ("chilled-water pump", "chilled_pump_w", GREEN),
+            ("condenser pump", "condenser_pump_w", PINK),
+            ("CRAC fan", "crac_fan_w", ORANGE),
         ),
     ),
-    "pue": Plot("PUE [-]", (PlotLine("PUE [-]", "pue", BLUE),)),
+    "pue": Plot("PUE", "-", (("PUE", "pue", BLUE),)),
     "water_l": Plot(
-        "water [L/step]",
+        "water",
+        "L/step",
         (
-            PlotLine("make-up [L/step]", "water_l", BLUE),
-            PlotLine("evaporation [L/step]", "evaporation_l", SKY),
-            PlotLine("blowdown [L/step]", "blowdown_l", ORANGE),
-            PlotLine("drift [L/step]", "drift_l", GREY),
+            ("make-up", "water_l", BLUE),
+            ("evaporation", "evaporation_l", SKY),
+            ("blowdown", "blowdown_l", ORANGE),
+            ("drift", "drift_l", GREY),
         ),
     ),
     "weather_c": Plot(
-        "weather [C]",
-        (
-            PlotLine("outdoor dry bulb [C]", "outdoor_c", ORANGE),
-            PlotLine("outdoor wet bulb [C]", "wet_bulb_c", SKY),
-        ),
+        "weather",
+        "C",
+        (("outdoor dry bulb", "outdoor_c", ORANGE), ("outdoor wet bulb", "wet_bulb_c", SKY)),
     ),
     "queue_age_h": Plot(
-        "age of the queue [h]",
-        (PlotLine("oldest [h]", "oldest_age_h", RED), PlotLine("mean [h]", "mean_age_h", BLUE)),
+        "age of the queue", "h", (("oldest", "oldest_age_h", RED), ("mean", "mean_age_h", BLUE))
     ),
     "work_tasks": Plot(
-        "work [tasks/step]",
+        "work",
+        "tasks/step",
         (
-            PlotLine("arrived [tasks/step]", "arrived_tasks", GREY),
-            PlotLine("executed [tasks/step]", "executed_tasks", BLUE),
-            PlotLine("overdue [tasks/step]", "overdue_tasks", ORANGE),
-            PlotLine("dropped [tasks/step]", "dropped_tasks", RED),
-            PlotLine("lost [tasks/step]", "lost_tasks", PINK),
+            ("arrived", "arrived_tasks", GREY),
+            ("executed", "executed_tasks", BLUE),
+            ("overdue", "overdue_tasks", ORANGE),
+            ("dropped", "dropped_tasks", RED),
+            ("lost", "lost_tasks", PINK),
         ),
     ),
     "load": Plot(
-        "load [share of capacity]",
-        (PlotLine("demand [-]", "demand", GREY), PlotLine("utilisation [-]", "utilisation", BLUE)),
+        "load",
+        "share of capacity",
+        (("demand", "demand", GREY), ("utilisation", "utilisation", BLUE)),
     ),
     "commands": Plot(
-        "commands [-]",
+        "commands",
+        "-",
         (
-            PlotLine("load, -1 defer to 1 drain [-]", "load_command", PINK),
-            PlotLine("cooling, setpoint steps [-]", "cooling_command", BLUE),
-            PlotLine("battery, -1 discharge to 1 charge [-]", "battery_command", GREEN),
+            ("load, -1 defer to 1 drain", "load_command", PINK),
+            ("cooling, setpoint steps", "cooling_command", BLUE),
+            ("battery, -1 discharge to 1 charge", "battery_command", GREEN),
         ),
     ),
 }
@@ -208,15 +189,15 @@ FIELDS: tuple[str, ...] = tuple(
     dict.fromkeys(
         [
             *FLEET_SUMS,
-            *(line.field for plot in PLOTS.values() for line in plot.lines if line.field != "pue"),
+            *(field for plot in PLOTS.values() for _, field, _ in plot.lines if field != "pue"),
             *(command for command, _ in COMMAND_STATES.values()),
             *EVENT_FIELDS,
         ]
     )
 )
-"""Fields that are read of every step, ``FLEET_SUMS`` first; PUE follows from the powers."""
-FIELD_ROWS = {field: row for row, field in enumerate(FIELDS)}
-"""Place of each field in ``FIELDS``."""
+"""Quantities that are read of every step, ``FLEET_SUMS`` first."""
+FIELD_ROWS = {field: row for row, field in enumerate((*FIELDS, "pue"))}
+"""Place of each quantity in ``FIELDS``; PUE, which follows from the powers, comes last."""
 
 
 class FleetPlot(NamedTuple):
@@ -226,8 +207,27 @@ class FleetPlot(NamedTuple):
     """Title of the plot, with the unit in brackets."""
     colour: int
     """Colour of the line as 0xRRGGBBAA."""
-    series: Callable[[Mapping[str, F64]], F64]
-    """From the sums of ``FLEET_SUMS`` and the highest ``inlet_max_c`` to the line, all (T,)."""
+    fields: tuple[str, ...]
+    """Entries of ``fleet_series`` that are added."""
+    factor: float = 1.0
+    """Unit of the fields divided by the unit of the line."""
+
+
+FLEET_PLOTS: dict[str, FleetPlot] = {
+    "pue": FleetPlot("PUE of all [-]", BLUE, ("pue",)),
+    "hottest_inlet_c": FleetPlot("hottest inlet of all [C]", ORANGE, ("inlet_max_c",)),
+    "it_kw": FleetPlot("IT power of all [kW]", BLUE, ("it_w",), 1e-3),
+    "carbon_kg": FleetPlot("carbon of all [kg/step]", RED, ("carbon_g",), 1e-3),
+    "water_l": FleetPlot("water of all [L/step]", SKY, ("water_l",)),
+    "queue_tasks": FleetPlot("queued in all [tasks]", PINK, ("queue_tasks",)),
+    "lost_tasks": FleetPlot(
+        "dropped or lost in all [tasks/step]", RED, ("dropped_tasks", "lost_tasks")
+    ),
+    "protected_racks": FleetPlot(
+        "racks throttled or off [-]", RED, ("throttled_racks", "tripped_racks")
+    ),
+}
+"""Plots over all data centers of the fleet, by entity."""
 
 
 def _pue(it_w: F64, overhead_w: F64) -> F64:
@@ -236,47 +236,34 @@ def _pue(it_w: F64, overhead_w: F64) -> F64:
     return np.where(some, 1.0 + overhead_w / np.where(some, it_w, 1.0), np.nan)
 
 
-def _sum_of(*fields: str, factor: float = 1.0) -> Callable[[Mapping[str, F64]], F64]:
-    """A function that adds up some fields and multiplies by a factor."""
-    return lambda total: np.sum([total[field] for field in fields], axis=0) * factor
-
-
-FLEET_PLOTS: dict[str, FleetPlot] = {
-    "pue": FleetPlot(
-        "PUE of all [-]",
-        BLUE,
-        lambda total: _pue(total["it_w"], total["overhead_w"]),
-    ),
-    "hottest_inlet_c": FleetPlot(
-        "hottest inlet of all [C]", ORANGE, lambda total: total["inlet_max_c"]
-    ),
-    "it_kw": FleetPlot("IT power of all [kW]", BLUE, _sum_of("it_w", factor=1e-3)),
-    "carbon_kg": FleetPlot("carbon of all [kg/step]", RED, _sum_of("carbon_g", factor=1e-3)),
-    "water_l": FleetPlot("water of all [L/step]", SKY, _sum_of("water_l")),
-    "queue_tasks": FleetPlot("queued in all [tasks]", PINK, _sum_of("queue_tasks")),
-    "lost_tasks": FleetPlot(
-        "dropped or lost in all [tasks/step]", RED, _sum_of("dropped_tasks", "lost_tasks")
-    ),
-    "protected_racks": FleetPlot(
-        "racks throttled or off [-]", RED, _sum_of("throttled_racks", "tripped_racks")
-    ),
-}
-"""Plots over all data centers of the fleet, by entity."""
-
-
 def append_pue(values: F64) -> F64:
     """Values of ``FIELDS``, (T, F, n), followed by the PUE, (T, F + 1, n)."""
     pue = _pue(values[:, FIELD_ROWS["it_w"]], values[:, FIELD_ROWS["overhead_w"]])
     return np.concatenate([values, pue[:, None]], axis=1)
 
 
-def plot_rows_and_factors(plot: Plot, step_h: float) -> tuple[list[int], F64]:
-    """Which rows of ``append_pue`` a plot shows, and what they are multiplied by, (lines,) each.
+def fleet_series(sums: F64, inlet_max_c: F64) -> dict[str, F64]:
+    """Series over all data centers by name, (T,) each, PUE among them.
+
+    Args:
+        sums: sums of ``FLEET_SUMS`` over the data centers, (T, sums).
+        inlet_max_c: hottest inlet of all, in C, (T,).
+    """
+    series = dict(zip(FLEET_SUMS, sums.T, strict=True))
+    return {
+        **series,
+        "inlet_max_c": inlet_max_c,
+        "pue": _pue(series["it_w"], series["overhead_w"]),
+    }
+
+
+def line_factors(plot: Plot, step_h: float) -> F64:
+    """Factors from the units of ``QUANTITIES`` to the unit of a plot, (lines,).
 
     Args:
         plot: the plot.
-        step_h: length of a step, in h.
+        step_h: length of a step, in h, which turns energies into powers.
     """
-    rows = [len(FIELDS) if line.field == "pue" else FIELD_ROWS[line.field] for line in plot.lines]
-    factors = [line.factor / step_h if line.per_hour else line.factor for line in plot.lines]
-    return rows, np.array(factors)
+    to_unit = {("W", "kW"): 1e-3, ("kWh", "kW"): 1.0 / step_h, ("g CO2e", "kg/step"): 1e-3}
+    units = ["1" if field == "pue" else QUANTITIES[field].unit for _, field, _ in plot.lines]
+    return np.array([to_unit.get((unit, plot.unit), 1.0) for unit in units])

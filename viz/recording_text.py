@@ -1,11 +1,11 @@
-"""Texts of a recording: the log of what goes wrong, the summary, and why racks are hot.
+"""Texts of a recording: its summary, and the log of failures and limits.
 
-What lasts has an entry of the log when it begins and one when it ends.
+A condition that lasts has one entry of the log when it begins and one when it ends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,17 +14,8 @@ import numpy.typing as npt
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
-from sdc_taichi.run.steps_file import AirAtStep
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.inlet_parts import (
-    HOTTEST_RACKS,
-    Inlets,
-    exhaust_terms,
-    inlet_terms,
-    rack_text,
-    state_texts,
-)
 from sdc_taichi.types import F64, I64, Reals, Status
 
 from .hall_rasters import ColourScale
@@ -37,6 +28,14 @@ MAX_RACKS_PER_STEP = 8
 """Largest number of racks named when those of a data center change status in one step."""
 _LEVELS = {NORMAL: "INFO", THROTTLED: "WARN", TRIPPED: "ERROR"}
 _STATUS_NAMES = {NORMAL: "back to normal", THROTTLED: "throttled", TRIPPED: "tripped"}
+
+
+_INPUTS_TEXTS = {
+    True: "These figures rest on **synthetic** inputs, not on measurements.",
+    False: "No input is synthetic.",
+    None: "",
+}
+"""Sentences about the inputs, by whether some are synthetic; None is not known."""
 
 
 class LogEntry(NamedTuple):
@@ -229,7 +228,7 @@ def protection_entries(
     racks_per_row: int,
     before: Status,
     after: Status,
-    hottest: Callable[[int], tuple[int | None, float]],
+    inlet_c: Reals,
 ) -> Iterator[LogEntry]:
     """Racks of a data center that throttled, tripped or came back in a step.
 
@@ -239,17 +238,15 @@ def protection_entries(
         racks_per_row: number of racks in a row of its hall.
         before: status of its racks before the step, (R,).
         after: status of its racks after the step, (R,).
-        hottest: from a rack to its hottest server, None if that is not known, and the server's
-            inlet in C.
+        inlet_c: hottest inlet of a server of each of its racks, in C, (R,).
     """
     changed = np.flatnonzero(before != after)
     # The worst first, so that those not named are the harmless ones.
     ordered = changed[np.argsort(-after[changed].astype(np.int64), kind="stable")].tolist()
     for rack in ordered[:MAX_RACKS_PER_STEP]:
         status = int(after[rack])
-        server, inlet_c = hottest(rack)
-        place = rack_place(rack, racks_per_row, server)
-        text = f"rack {_STATUS_NAMES[status]}: {place}, inlet {inlet_c:.1f} C"
+        place = rack_place(rack, racks_per_row)
+        text = f"rack {_STATUS_NAMES[status]}: {place}, inlet {inlet_c[rack]:.1f} C"
         yield LogEntry(step, dc, _LEVELS[status], text)
     if len(ordered) > MAX_RACKS_PER_STEP:
         rest = after[ordered[MAX_RACKS_PER_STEP:]]
@@ -310,19 +307,6 @@ def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
     return "grid outage"
 
 
-def hottest_server(inlet_c: Reals, fleet: Fleet, rack: int) -> tuple[int, float]:
-    """Hottest server of a rack, counted from the floor, and its inlet in C.
-
-    Args:
-        inlet_c: inlets of the server groups, in C, (G,).
-        fleet: the fleet.
-        rack: index of the rack, counted over the whole fleet.
-    """
-    first, last = fleet.group_offsets[rack : rack + 2]
-    group = first + int(np.argmax(inlet_c[first:last]))
-    return int(fleet.server_offsets[group] - fleet.server_offsets[first]), float(inlet_c[group])
-
-
 def summary_markdown(
     description: Mapping[str, Any],
     fleet: Fleet,
@@ -330,10 +314,10 @@ def summary_markdown(
     scales: Mapping[str, ColourScale],
     cadence: Cadence,
 ) -> str:
-    """Markdown of what was run, on which inputs, and how to read the recording.
+    """Markdown about the run, its inputs, and how to read the recording.
 
     Args:
-        description: what ``describe_run`` says of the run, or a part of it.
+        description: result of ``describe_run``, or a part of it.
         fleet: the fleet.
         focus: from the index of each data center in focus to its name in the recording.
         scales: colour scales of the heat maps, by quantity.
@@ -358,7 +342,7 @@ def summary_markdown(
         "",
         f"Colours cover: {ranges}; values beyond are drawn as its ends. Resolution: {resolution}.",
         "",
-        _inputs_text(description),
+        _INPUTS_TEXTS[description.get("synthetic")],
         "",
         "| | |",
         "|---|---|",
@@ -370,44 +354,11 @@ def summary_markdown(
     ]
     data_centers = description.get("data_centers", ())
     for dc, name in focus.items():
-        own = data_centers[dc] if data_centers else {}
-        lines += ["", *_data_center_lines(fleet, dc, name, own)]
+        about = data_centers[dc] if data_centers else {}
+        lines += ["", *_data_center_lines(fleet, dc, name, about)]
     if fleet.size > len(focus):
         rest = _count_text(fleet.size - len(focus), "other data center")
         lines += ["", f"The {rest} count in the fleet series only."]
-    return "\n".join(lines)
-
-
-def hottest_markdown(fleet: Fleet, dc: int, air: AirAtStep, clock: str) -> str:
-    """Markdown that says why the hottest racks of a data center are as hot as they are.
-
-    Args:
-        fleet: the fleet.
-        dc: index of the data center.
-        air: its air in its hottest step.
-        clock: when the step begins, on the clock of the data center.
-    """
-    per_row = fleet.configs[dc].hall.racks_per_row
-    inlets = Inlets(fleet, dc, air.air)
-    when = clock[5:].replace("T", " ")
-    lines = ["# Why the hottest racks are hot", f"At the end of step {air.step}, {when}."]
-    for rack in inlets.hottest(HOTTEST_RACKS):
-        parts = inlets.parts(rack)
-        (first, setpoint_c), *others = inlet_terms(parts, per_row)
-        lines += [
-            "",
-            f"## {rack_text(rack, per_row)}: {parts.inlet_c:.2f} C",
-            "",
-            "| | |",
-            "|---:|---|",
-            f"| {setpoint_c:.2f} C | {first} |",
-            *(f"| {k:+.2f} K | {text} |" for text, k in others),
-            "",
-        ]
-        why = ", ".join(f"{k:+.2f} K {text}" for text, k in exhaust_terms(parts))
-        if why:
-            lines += [f"{100 * parts.exhaust_share:.1f} % of its intake is exhaust air: {why}.", ""]
-        lines += [f"- {text}" for text in state_texts(parts)]
     return "\n".join(lines)
 
 
@@ -428,30 +379,13 @@ def _levels_text(cadence: Cadence) -> str:
     return f"at each of {_count_text(max(cadence.levels), 'height')}, its back the hottest outlet"
 
 
-def _inputs_text(description: Mapping[str, Any]) -> str:
-    """Whether inputs are synthetic, in words."""
-    if "synthetic" not in description:
-        return ""
-    if description["synthetic"]:
-        return "These figures rest on **synthetic** inputs, not on measurements."
-    return "No input is synthetic."
-
-
 def _facts(description: Mapping[str, Any]) -> dict[str, str]:
     """Facts of the run that are known, by name."""
-    known = {
-        name: description[name]
-        for name in ("controller", "seed", "precision")
-        if name in description
-    }
-    facts = {name: str(value) for name, value in known.items()}
-    if "fingerprint" in description:
-        facts["fingerprint"] = f"`{description['fingerprint']}`"
-    versions: Mapping[str, str] = description.get("versions", {})
-    if versions:
+    names = ("controller", "seed", "precision", "fingerprint")
+    facts = {name: str(description[name]) for name in names if name in description}
+    if versions := description.get("versions"):
         facts["versions"] = ", ".join(f"{name} {number}" for name, number in versions.items())
-    notes: Sequence[str] = description.get("notes", ())
-    if notes:
+    if notes := description.get("notes"):
         facts["notes"] = "; ".join(note.replace("|", r"\|") for note in notes)
     return facts
 

@@ -33,7 +33,7 @@ from .recording_series import (
 PLAYBACK_S_PER_S = 14_400.0
 """Simulated seconds per second of playback."""
 MAX_UNIT_LINES = 24
-"""Largest number of CRAC units with a line each; of more their range is plotted."""
+"""Largest number of CRAC units with a line each; for more, plots show their range."""
 
 MAX_ROW_LABELS = 5
 """Largest number of rows of the 3D hall with a label; more would cover each other."""
@@ -58,19 +58,16 @@ class FocusTab(NamedTuple):
     """Height and width of the heat maps, in pixels."""
 
 
-def make_blueprint(
-    tabs: Sequence[FocusTab], *, has_hottest: bool, has_rewards: bool
-) -> rrb.Blueprint:
+def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Blueprint:
     """Arrange the views of a recording.
 
     Args:
         tabs: tabs of the data centers in focus.
-        has_hottest: whether the hottest halls are recorded.
         has_rewards: whether reward terms are recorded.
     """
     focus_tabs = (_focus_tab(tab, has_rewards=has_rewards) for tab in tabs)
     return rrb.Blueprint(
-        rrb.Tabs(*focus_tabs, _fleet_tab(has_hottest=has_hottest)),
+        rrb.Tabs(*focus_tabs, _fleet_tab()),
         rrb.TimePanel(
             timeline="sim_time",
             playback_speed=PLAYBACK_S_PER_S,
@@ -83,17 +80,14 @@ def make_blueprint(
     )
 
 
-def _fleet_tab(*, has_hottest: bool) -> Any:
-    """Texts, and plots over all data centers."""
-    texts = [rrb.TextDocumentView(origin="summary", name="summary")]
-    if has_hottest:
-        texts.append(rrb.TextDocumentView(origin="fleet/hottest", name="hottest halls"))
+def _fleet_tab() -> Any:
+    """Summary, and plots over all data centers."""
     plots = [
         _plot_view(f"fleet/{entity}", plot.title, legend=False)
         for entity, plot in FLEET_PLOTS.items()
     ]
     return rrb.Horizontal(
-        rrb.Vertical(*texts),
+        rrb.TextDocumentView(origin="summary", name="summary"),
         rrb.Grid(*plots, grid_columns=2),
         column_shares=[2, 3],
         name="fleet",
@@ -114,9 +108,7 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
             text_log_columns=["loglevel", "body"],
         ),
     )
-    hottest = rrb.TextDocumentView(origin=f"{tab.path}/hottest", name="why the hottest are hot")
-    texts = rrb.Tabs(events, hottest, active_tab=0)
-    hall = rrb.Vertical(maps, _hall_view(tab), texts, row_shares=[5, 4, 2])
+    hall = rrb.Vertical(maps, _hall_view(tab), events, row_shares=[5, 4, 2])
     return rrb.Horizontal(
         hall,
         _plot_tabs(tab, has_rewards=has_rewards),
@@ -169,7 +161,7 @@ def _series_view(tab: FocusTab, entity: str) -> Any:
     plot = PLOTS[entity]
     # The title of a plot with one line is its name.
     legend = len(plot.lines) > 1
-    return _plot_view(origin, plot.title, limits=plot.limits, legend=legend)
+    return _plot_view(origin, f"{plot.title} [{plot.unit}]", limits=plot.limits, legend=legend)
 
 
 def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
@@ -271,8 +263,8 @@ def data_center_entities(
         rewards: names of the reward terms.
     """
     for entity, plot in PLOTS.items():
-        names = [line.name for line in plot.lines]
-        yield f"{path}/series/{entity}", _lines(names, [line.colour for line in plot.lines])
+        names = [f"{name} [{plot.unit}]" for name, *_ in plot.lines]
+        yield f"{path}/series/{entity}", _lines(names, [colour for *_, colour in plot.lines])
     yield f"{path}/series/{QUEUE_ENTITY}", _lines(QUEUE_NAMES, QUEUE_COLOURS)
     if rewards:
         reward_colours = [PALETTE[i % len(PALETTE)] for i in range(len(rewards))]
@@ -324,7 +316,8 @@ def _hall_entities(
         )
         yield f"{path}/{quantity}", voxels
     plan, height_m = floor_plan(hall), hall.layout.rack_height_m
-    walls = rasters.room_outline_m(plan, hall.layout.ceiling_m)
+    corners = [(0.0, 0.0), (plan.length_m, 0.0), (plan.length_m, plan.width_m), (0.0, plan.width_m)]
+    walls = [[(x, y, z) for x, y in (*corners, corners[0])] for z in (0.0, hall.layout.ceiling_m)]
     yield f"{path}/room", rr.LineStrips3D(walls, colors=[[110, 110, 110]], radii=0.02)
     beside = plan.row_ends_m[0] - 0.6
     labelled = range(0, hall.rows, -(-hall.rows // MAX_ROW_LABELS))
@@ -336,8 +329,13 @@ def _hall_entities(
         show_labels=True,
     )
     yield f"{path}/rows", rows
+    # CRAC units stand outside the end walls.
+    unit_centres_m = [
+        (x + (0.5 if x > plan.length_m / 2 else -0.5), y, height_m / 2)
+        for x, y in unit_places_m(plan, units)
+    ]
     boxes = rr.Boxes3D(
-        centers=rasters.crac_box_centres_m(unit_places_m(plan, units), plan, height_m),
+        centers=unit_centres_m,
         sizes=[(0.8, 1.2, height_m)] * units,
         fill_mode="solid",
         colors=[80, 170, 230],
@@ -363,7 +361,7 @@ def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
 
 
 def _colour_bar(quantity: str, scale: ColourScale) -> dict[str, Any]:
-    """A gradient with labelled points, because the viewer has no colour bar of its own."""
+    """A gradient with labelled points, because the viewer has no colour bar."""
     gradient, marks = rasters.colour_bar(scale)
     height, width = gradient.shape
     bar = rr.DepthImage(

@@ -7,7 +7,6 @@ Entities of a recording, NAME being a data center in focus:
     dc/NAME/series/..., crac/...       lines, an entity per unit
     dc/NAME/actions/...                commands, as states
     dc/NAME/events                     log
-    dc/NAME/hottest                    why the hottest racks are hot, at the end of the recording
     fleet/...                          sums and extremes over all data centers
     legend/..., summary                static
 
@@ -20,7 +19,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +27,6 @@ import rerun as rr
 
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.steps_file import HottestAir
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import hall_rasters as rasters
@@ -41,10 +39,9 @@ from .recording_series import (
     PLOTS,
     QUEUE_ENTITY,
     REWARDS_ENTITY,
-    append_pue,
-    plot_rows_and_factors,
+    line_factors,
 )
-from .recording_text import ConditionLog, LogEntry, hottest_markdown, summary_markdown
+from .recording_text import ConditionLog, LogEntry, summary_markdown
 from .recording_views import (
     MAX_UNIT_LINES,
     FocusTab,
@@ -56,13 +53,8 @@ from .recording_views import (
 if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
 
-Real = TypeVar("Real", bound=np.floating[Any])
-"""Number type of the frames."""
-Frames: TypeAlias = dict[tuple[int, str], npt.NDArray[Real]]
-"""Heat maps or voxel values by data center in focus and quantity."""
-
 LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
-"""Longest time between two blocks if somebody may watch, and if nobody does, in s."""
+"""Longest time between two blocks of a live recording, and of a file, in s."""
 _NO_COMMAND = 2
 """Stands for the sign of a command before the first step."""
 
@@ -74,8 +66,8 @@ class RecordingWriter:
         sim: the simulator, before its first step.
         names: names of its data centers in the recording.
         focus: indices of the data centers in focus.
-        description: what ``describe_run`` says of the run, or a part of it.
-        output: where the recording goes.
+        description: result of ``describe_run``, or a part of it.
+        output: destination of the recording.
         every_steps: steps between two heat maps and between two frames of the 3D hall; None
             follows the number of racks in focus.
     """
@@ -94,8 +86,11 @@ class RecordingWriter:
         self._names, self._focus = names, focus
         self._start = sim.drivers.start[focus]
         self._cadence = choose_cadence(fleet, focus, every_steps)
-        self._builder = BlockBuilder(sim, names, focus, self._cadence)
-        self._plots = {e: plot_rows_and_factors(plot, sim.step_h) for e, plot in PLOTS.items()}
+        self._builder = BlockBuilder(sim, focus, self._cadence)
+        self._rows_and_factors = {
+            entity: ([FIELD_ROWS[f] for _, f, _ in plot.lines], line_factors(plot, sim.step_h))
+            for entity, plot in PLOTS.items()
+        }
         self._scales = {
             quantity: rasters.temperature_scale(quantity)
             for quantity in rasters.TEMPERATURE_RANGES_C
@@ -103,7 +98,6 @@ class RecordingWriter:
         self._scales["power"] = rasters.power_scale(fleet)
         self._tile_grids = [rasters.tile_grid(fleet.configs[dc].hall) for dc in focus]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
-        self._hottest_air = HottestAir(sim, focus)
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
         """Number of steps added."""
@@ -129,63 +123,45 @@ class RecordingWriter:
         if self.failed:
             return
         self._builder.add(result, rewards)
-        self._hottest_air.add(result)
         self.steps_added += 1
         is_late = time.monotonic() - self._written_at_s > self._block_s
-        if is_late or self._builder.steps == self._cadence.block_steps:
+        if is_late or self._builder.is_full:
             self._write_block()
 
     def flush(self) -> None:
-        """Write the steps that wait for their block to be complete, and why racks are hot."""
+        """Write the steps that wait for their block to be complete."""
         if self._builder.steps and not self.failed:
             self._write_block()
-        if self._output.is_open and not self.failed:
-            self._write_hottest()
 
     def close(self) -> None:
-        """Write what is left, and the index."""
+        """Write the remaining steps and the index."""
         self.flush()
         self._output.close()
-
-    def _write_hottest(self) -> None:
-        """Say why the hottest racks of each data center in focus are hot."""
-        for index, dc in enumerate(self._focus):
-            hottest = self._hottest_air.of(dc)
-            if hottest is None:
-                continue
-            clock = self._clock(np.array([hottest.step]))[0, index]
-            text = hottest_markdown(self._fleet, dc, hottest, str(clock.astype("datetime64[m]")))
-            document = rr.TextDocument(text, media_type="text/markdown")
-            self._output.send_static(f"{self._path(dc)}/hottest", document)
 
     def _write_block(self) -> None:
         """Write the block under way."""
         self._written_at_s = time.monotonic()
         block = self._builder.take()
-        values = append_pue(block.values)
         for index, log in enumerate(self._condition_logs):
-            block.entries.extend(log.entries(block.steps, values[:, :, index]))
-        maps, voxels = self._heat_maps(block), self._voxel_values(block)
-        size_bytes = 2 * values.nbytes + sum(frames.nbytes for frames in maps.values())
-        size_bytes += sum(frames.nbytes for frames in voxels.values())
-        if not self._output.has_room_for(size_bytes):
+            block.entries.extend(log.entries(block.steps, block.values[:, :, index]))
+        if not self._output.has_room_for(block.size_bytes):
             return
         if not self._output.is_open:
             self._open()
         times, map_times, hall_times = map(
             self._times, (block.steps, block.map_steps, block.hall_steps)
         )
-        self._write_fleet(block, times[0], hall_times[0])
+        self._write_fleet(block, times[0])
         for index, dc in enumerate(self._focus):
-            path, own = self._path(dc), values[:, :, index]
-            self._write_lines(block, index, path, times[index], own)
-            self._write_states(index, path, block.steps, own)
+            path, values = self._path(dc), block.values[:, :, index]
+            self._write_lines(block, index, path, times[index], values)
+            self._write_states(index, path, block.steps, values)
             self._write_log(index, path, [e for e in block.entries if e.dc == dc])
-            self._write_frames(index, path, maps, map_times[index], voxels, hall_times[index])
+            self._write_frames(block, index, path, map_times[index], hall_times[index])
         self._output.send_block()
 
     def _open(self) -> None:
-        """Open the output and send what holds at all times."""
+        """Open the output and send the static entities."""
         tabs = []
         for dc, grid in zip(self._focus, self._tile_grids, strict=True):
             hall = self._fleet.configs[dc].hall
@@ -194,8 +170,7 @@ class RecordingWriter:
             name, path = self._names[dc], self._path(dc)
             tabs.append(FocusTab(name, path, size_m, self._scales, grid.image_shape))
         rewards = self._builder.reward_names or ()
-        has_hottest = self._fleet.size > 1
-        self._output.open(make_blueprint(tabs, has_hottest=has_hottest, has_rewards=bool(rewards)))
+        self._output.open(make_blueprint(tabs, has_rewards=bool(rewards)))
         names = {dc: self._names[dc] for dc in self._focus}
         text = summary_markdown(self._description, self._fleet, names, self._scales, self._cadence)
         self._output.send_static("summary", rr.TextDocument(text, media_type="text/markdown"))
@@ -207,22 +182,17 @@ class RecordingWriter:
             ):
                 self._output.send_static(entity, component)
 
-    def _write_fleet(
-        self, block: Block, times: list[rr.TimeColumn], hall_times: list[rr.TimeColumn]
-    ) -> None:
-        """Series over all data centers, and the hottest halls."""
+    def _write_fleet(self, block: Block, times: list[rr.TimeColumn]) -> None:
+        """Series over all data centers."""
         for entity, plot in FLEET_PLOTS.items():
-            self._write_scalars(f"fleet/{entity}", times, plot.series(block.fleet)[:, None])
-        if block.hottest:
-            media_types = ["text/markdown"] * len(block.hottest)
-            texts = rr.TextDocument.columns(text=block.hottest, media_type=media_types)
-            self._output.add_columns("fleet/hottest", hall_times, texts)
+            values = plot.factor * np.sum([block.fleet[field] for field in plot.fields], axis=0)
+            self._write_scalars(f"fleet/{entity}", times, values[:, None])
 
     def _write_lines(
         self, block: Block, index: int, path: str, times: list[rr.TimeColumn], values: F64
     ) -> None:
         """Series of a data center: plots, queue, rewards and CRAC units."""
-        for entity, (rows, factors) in self._plots.items():
+        for entity, (rows, factors) in self._rows_and_factors.items():
             self._write_scalars(f"{path}/series/{entity}", times, values[:, rows] * factors)
         queue = block.queue_by_age[:, index]
         self._write_scalars(f"{path}/series/{QUEUE_ENTITY}", times, queue)
@@ -270,45 +240,25 @@ class RecordingWriter:
 
     def _write_frames(
         self,
+        block: Block,
         index: int,
         path: str,
-        maps: Frames[np.float16],
         map_times: list[rr.TimeColumn],
-        voxels: Frames[np.float32],
         hall_times: list[rr.TimeColumn],
     ) -> None:
         """Heat maps and 3D hall of a data center."""
-        for quantity in self._scales:
-            if (index, quantity) in maps:
-                frames = maps[index, quantity]
-                pixels = frames.reshape(len(frames), -1).view(np.uint8)
-                columns = rr.DepthImage.columns(buffer=pixels)
-                self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
-            if (index, quantity) in voxels:
-                values = voxels[index, quantity]
-                columns = rr.VoxelGridMap.columns(values=values.reshape(-1))
-                parts = columns.partition(np.full(len(values), values.shape[1]))
-                self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
-
-    def _heat_maps(self, block: Block) -> Frames[np.float16]:
-        """Heat maps, (M, height, width)."""
-        if not len(block.map_steps):
-            return {}
-        return {
-            (index, quantity): rasters.heat_maps(
-                values[:, racks], self._tile_grids[index], self._scales[quantity]
-            )
-            for index, racks in enumerate(self._builder.racks)
-            for quantity, values in block.maps.items()
-        }
-
-    def _voxel_values(self, block: Block) -> Frames[np.float32]:
-        """Values of the voxels, (H, levels of the racks)."""
-        return {
-            (index, quantity): rasters.quantised(values[:, levels], self._scales[quantity])
-            for index, levels in enumerate(self._builder.levels)
-            for quantity, values in block.halls.items()
-        }
+        racks, levels = self._builder.racks[index], self._builder.levels[index]
+        for quantity, values in block.maps.items():
+            scale = self._scales[quantity]
+            frames = rasters.heat_maps(values[:, racks], self._tile_grids[index], scale)
+            pixels = frames.reshape(len(frames), -1).view(np.uint8)
+            columns = rr.DepthImage.columns(buffer=pixels)
+            self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
+        for quantity, values in block.halls.items():
+            voxels = rasters.quantised(values[:, levels], self._scales[quantity])
+            columns = rr.VoxelGridMap.columns(values=voxels.reshape(-1))
+            parts = columns.partition(np.full(len(voxels), voxels.shape[1]))
+            self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
 
     def _clock(self, steps: I64) -> npt.NDArray[np.datetime64]:
         """Time at which steps begin on the clocks of the data centers in focus, (T, n)."""

@@ -1,4 +1,4 @@
-"""One HTML file that tells what a run did: summary, tables, pictures.
+"""HTML report of a run: one file with a summary, tables and pictures.
 
 The file holds everything it shows, styles and pictures as data, and no script; its content security
 policy forbids whatever would reach for the network. Equal runs give equal bytes, as
@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
-from sdc_taichi.run.folder_reader import RunFolder, is_number, read_configs
+from sdc_taichi.run.folder_reader import RunFolder, read_configs
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 from sdc_taichi.run.inlets_of_run import InletsAtStep, hottest_inlets
 from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, rack_text, state_texts
@@ -38,105 +37,16 @@ from .report_html import (
     time_span_text,
     time_text,
 )
-from .report_metrics import LABELS, MAX_DC_COLUMNS, comparison_section, metrics_section
+from .report_metrics import MAX_DC_COLUMNS, comparison_section, metrics_section
 from .report_pictures import (
     data_center_section,
     fleet_section,
     inputs_section,
     known_optimum,
     optimum_section,
-    shares_of,
+    share_of,
     shown_data_centers,
 )
-
-RATIOS = ("pue", "pue_with_losses", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh")
-"""Metrics that are undefined without IT energy."""
-
-
-def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
-    """Write the report of a run.
-
-    Args:
-        run: the run, from ``read_run``.
-        others: runs to compare it with, of equal length.
-        out: the file; None is ``report.html`` in the run's folder, replaced if it exists.
-
-    Returns:
-        The file.
-
-    Raises:
-        SdcError: matplotlib is missing, steps.parquet is damaged, the runs cannot be compared, or
-            the file cannot be written.
-    """
-    target = run.path / REPORT_FILE if out is None else out
-    # Opened first, so that a place that cannot be written is known before the work.
-    with atomic_write(target) as file:
-        file.write(report_html(run, others).encode("utf-8", "replace"))
-    return target
-
-
-def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
-    """The report of a run as text.
-
-    Args:
-        run: the run.
-        others: runs to compare it with, of equal length.
-
-    Raises:
-        SdcError: matplotlib is missing, a file is damaged, or the runs cannot be compared.
-    """
-    for each in (run, *others):
-        _check_metrics(each)
-    sections = {
-        "Summary": summary_section(run),
-        "Metrics": metrics_section(run),
-    }
-    optimum = known_optimum([run, *others])
-    if others:
-        shares = None if optimum is None else shares_of([run, *others], optimum)
-        sections["Comparison"] = comparison_section([run, *others], shares)
-    sections["Events"] = events_section(run)
-    shown = shown_data_centers(run)
-    if optimum is not None:
-        sections["Known optimum"] = optimum_section(run, optimum, shown)
-    if len(run.names) > 1 and run.metrics["steps_done"] > 1:
-        sections["All data centers"] = fleet_section(run)
-    for dc in shown:
-        sections[f"Data center {run.names[dc.index]}"] = data_center_section(run, dc)
-    sections["Why the hottest racks are hot"] = hot_racks_section(run, [dc.index for dc in shown])
-    if run.metrics["steps_done"] > 1:
-        sections["Inputs"] = inputs_section(run, shown)
-    sections["Provenance"] = provenance_section(run)
-    count = len(run.names)
-    names = ", ".join(run.names) if count <= MAX_DC_COLUMNS else f"{count:,} data centers"
-    title = f"Run of {names} under {run.metrics['controller']}"
-    own_page = {f"Data center {name}" for name in run.names}
-    return html_page(title, time_span_text(run), sections, own_page)
-
-
-def _check_metrics(run: RunFolder) -> None:
-    """Refuse a metrics.json that lacks a metric of the report, or has one out of range."""
-    path, dcs = run.path / METRICS_FILE, run.metrics["data_centers"]
-    # Rows, racks of a hall and servers of a rack are far fewer.
-    places = dict.fromkeys(("hottest_row", "hottest_rack", "hottest_server"), 10**9)
-    places["hottest_step"] = run.metrics["steps_done"] - 1
-    all_metrics = {f"data_centers[{i}].metrics": dc["metrics"] for i, dc in enumerate(dcs)}
-    for where, metrics in {"total": run.metrics["total"], **all_metrics}.items():
-        undefined = {"time_to_throttle_min", *(RATIOS if metrics.get("it_kwh") == 0 else ())}
-        for key in LABELS:
-            value = metrics.get(key, "missing")
-            if not is_number(value) and (value is not None or key not in undefined):
-                raise SdcError(f"{path}: {where}.{key} is {value!r}; valid is a number")
-        for key, most in places.items():
-            value = metrics.get(key)
-            if not (is_number(value) and isinstance(value, int) and 0 <= value <= most):
-                raise SdcError(
-                    f"{path}: {where}.{key} is {value!r}; valid is a whole number, 0..{most}"
-                )
-    hottest = run.metrics["total"].get("hottest_dc")
-    if hottest not in run.names:
-        raise SdcError(f"{path}: total.hottest_dc {hottest!r}: no such data center")
-
 
 KEY_METRICS = (
     ("facility energy", "facility_kwh", "kWh"),
@@ -173,6 +83,65 @@ INLET_HEADS = (
 follow it."""
 APPROACH_HEADS = (*INLET_HEADS[:4], "approach temperature (K)")
 """Columns of the table of a hall without recirculation; the inlet is the sum of the others."""
+
+
+def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
+    """Write the report of a run.
+
+    Args:
+        run: the run, from ``read_run``.
+        others: runs to compare it with, of equal length.
+        out: the file; None is ``report.html`` in the run's folder, replaced if it exists.
+
+    Returns:
+        The file.
+
+    Raises:
+        SdcError: matplotlib is missing, steps.parquet is damaged, the runs cannot be compared, or
+            the file cannot be written.
+    """
+    target = run.path / REPORT_FILE if out is None else out
+    # Opened first, so that a place that cannot be written is known before the work.
+    with atomic_write(target) as file:
+        file.write(report_html(run, others).encode("utf-8", "replace"))
+    return target
+
+
+def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
+    """The report of a run as text.
+
+    Args:
+        run: the run.
+        others: runs to compare it with, of equal length.
+
+    Raises:
+        SdcError: matplotlib is missing, a file is damaged, or the runs cannot be compared.
+    """
+    sections = {
+        "Summary": summary_section(run),
+        "Metrics": metrics_section(run),
+    }
+    optimum = known_optimum([run, *others])
+    if others:
+        shares = None if optimum is None else [share_of(x, optimum) for x in (run, *others)]
+        sections["Comparison"] = comparison_section([run, *others], shares)
+    sections["Events"] = events_section(run)
+    shown = shown_data_centers(run)
+    if optimum is not None:
+        sections["Known optimum"] = optimum_section(run, optimum, shown)
+    if len(run.names) > 1 and run.metrics["steps_done"] > 1:
+        sections["All data centers"] = fleet_section(run)
+    for dc in shown:
+        sections[f"Data center {run.names[dc.index]}"] = data_center_section(run, dc)
+    sections["Why the hottest racks are hot"] = hot_racks_section(run, [dc.index for dc in shown])
+    if run.metrics["steps_done"] > 1:
+        sections["Inputs"] = inputs_section(run, shown)
+    sections["Provenance"] = provenance_section(run)
+    count = len(run.names)
+    names = ", ".join(run.names) if count <= MAX_DC_COLUMNS else f"{count:,} data centers"
+    title = f"Run of {names} under {run.metrics['controller']}"
+    own_page = {f"Data center {name}" for name in run.names}
+    return html_page(title, time_span_text(run), sections, own_page)
 
 
 def summary_section(run: RunFolder) -> str:
@@ -258,74 +227,34 @@ def _work_texts(run: RunFolder) -> list[str]:
     return texts
 
 
-class _Event(NamedTuple):
-    """A failure, outage or heat wave of a data center."""
-
-    dc: int
-    """Index of the data center."""
-    kind: str
-    """Kind in words."""
-    begin: int
-    """First step."""
-    end: int
-    """Step after the last."""
-    target: str
-    """Unit or rack of the hall, empty for the whole."""
-    amount: str
-    """Share left of a device, or difference of temperature."""
-
-
 def events_section(run: RunFolder) -> str:
-    """Failures, outages and heat waves of the run, one by one, or by kind if there are many."""
+    """Table of the failures, outages and heat waves of the run, of many the first ones."""
     events = [
-        _Event(
-            index,
-            str(event["kind"]).replace("_", " "),
-            event["start_step"],
-            event["end_step"],
-            str(event.get("target", "")),
-            (f"{100 * event['share']:.0f} % left" if "share" in event else "")
-            + (f"{event['offset_k']:+g} K" if "offset_k" in event else ""),
-        )
-        for index, dc in enumerate(run.metrics["data_centers"])
-        for event in dc["events"]
+        (dc, event)
+        for dc, about in enumerate(run.metrics["data_centers"])
+        for event in about["events"]
     ]
     if not events:
         return paragraph("None: the run met no failure, outage or heat wave.")
-    step_h = run.metrics["step_h"]
-    caption = f"{count_text(len(events), 'event')} that the run met"
-    if len(events) > MAX_ROWS:
-        return _events_by_kind(run, events, f"{caption}, by kind; all are in {METRICS_FILE}")
     rows = [
         (
-            run.names[event.dc],
-            event.kind,
-            event.target,
-            event.amount,
-            time_text(run, local_time(run, event.dc, event.begin)),
-            format_number((event.end - event.begin) * step_h),
-            f"{event.begin} to {event.end - 1}",
+            run.names[dc],
+            str(event["kind"]).replace("_", " "),
+            str(event.get("target", "")),
+            (f"{100 * event['share']:.0f} % left" if "share" in event else "")
+            + (f"{event['offset_k']:+g} K" if "offset_k" in event else ""),
+            time_text(run, local_time(run, dc, event["start_step"])),
+            format_number((event["end_step"] - event["start_step"]) * run.metrics["step_h"]),
+            f"{event['start_step']} to {event['end_step'] - 1}",
         )
-        for event in events
+        for dc, event in events[:MAX_ROWS]
     ]
+    caption = f"{count_text(len(events), 'event')} that the run met"
+    if len(events) > MAX_ROWS:
+        caption += f", the first {MAX_ROWS}; all are in {METRICS_FILE}"
     heads = ("data center", "event", "unit or rack in hall", "amount",
              "from (local standard time)", "duration (h)", "steps")  # fmt: skip
     return html_table(caption, heads, rows, numbers=(5, 6))
-
-
-def _events_by_kind(run: RunFolder, events: Sequence[_Event], caption: str) -> str:
-    """Table of events with a row for each kind."""
-    rows = []
-    for kind in sorted({event.kind for event in events}):
-        alike = [event for event in events if event.kind == kind]
-        first = min(alike, key=lambda event: event.begin)
-        hours = sum(event.end - event.begin for event in alike) * run.metrics["step_h"]
-        figures = (len(alike), len({event.dc for event in alike}), hours)
-        begin = time_text(run, local_time(run, first.dc, first.begin))
-        rows.append((kind, *map(format_number, figures), f"{begin} in {run.names[first.dc]}"))
-    heads = ("event", "events", "data centers", "duration together (h)",
-             "first (local standard time)")  # fmt: skip
-    return html_table(caption, heads, rows, numbers=(1, 2, 3))
 
 
 def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:

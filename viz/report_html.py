@@ -1,6 +1,6 @@
-"""HTML and words of a report: page, tables, notices and pictures; numbers, names and times.
+"""HTML of reports: page, tables, notices and pictures; texts of numbers, names and times.
 
-The HTML comes from the template ``report.html``, which escapes every text that it is given.
+The HTML comes from the template ``report.html``, which escapes every text.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ def folded(summary: str, text: str) -> str:
 
 
 def metric_text(metrics: Mapping[str, Any], key: str) -> str:
-    """A metric as text, a dash where it is not defined."""
-    value = metrics[key]
+    """A metric as text, a dash where it is not known or not defined."""
+    value = metrics.get(key)
     return DASH if value is None else format_number(value)
 
 
@@ -179,7 +179,7 @@ def time_span_text(run: RunFolder) -> str:
 
 
 def run_labels(runs: Sequence[RunFolder]) -> list[str]:
-    """Names of runs: their controllers, with their folders where these do not tell them apart."""
+    """Names of runs: their controllers, with their folders where controllers are equal."""
     names = [run.metrics["controller"] for run in runs]
     if len(set(names)) < len(names):
         names = [f"{n} ({run.path.resolve().name})" for n, run in zip(names, runs, strict=True)]

@@ -8,7 +8,7 @@ from typing import Any
 from sdc_taichi.errors import SdcError
 from sdc_taichi.run.folder_reader import RunFolder
 
-from .fleet_figures import MAX_RUNS, RADAR_METRICS, radar
+from .fleet_figures import RADAR_METRICS, radar
 from .plotting import format_number
 from .report_html import (
     DASH,
@@ -163,7 +163,7 @@ def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
 
 def _values(dcs: Sequence[dict[str, Any]], key: str) -> list[tuple[float, str]]:
     """Values of a metric with the names of the data centers that have one."""
-    pairs = [(dc["metrics"][key], dc["name"]) for dc in dcs]
+    pairs = [(dc["metrics"].get(key), dc["name"]) for dc in dcs]
     return [pair for pair in pairs if pair[0] is not None]
 
 
@@ -196,8 +196,7 @@ def comparison_section(
 
     Args:
         runs: the runs.
-        shares: share of the achievable of each, None where it is not known; None without a known
-            optimum.
+        shares: share of the achievable of each run, None where unknown; None without an optimum.
 
     Raises:
         SdcError: runs of other length than the first one, or too many.
@@ -209,8 +208,6 @@ def comparison_section(
                 f"{run.path}: {run.hours:g} h, {first.path}: {first.hours:g} h; runs to "
                 "compare must be of equal length"
             )
-    if len(runs) > MAX_RUNS:
-        raise SdcError(f"{len(runs)} runs to compare; valid are up to {MAX_RUNS}")
     totals = {label: run.metrics["total"] for label, run in zip(labels, runs, strict=True)}
     fingerprint = first.metrics["fingerprint"]
     different = [
@@ -256,7 +253,7 @@ def _comparison_table(
         for total in list(totals.values())[1:]:
             text = metric_text(total, key)
             # A temperature has no zero to be a share of.
-            if base[key] and total[key] is not None and not key.endswith("_c"):
+            if base.get(key) and total.get(key) is not None and not key.endswith("_c"):
                 text += f" ({100 * (total[key] / base[key] - 1):+z.2f} %)"
             cells.append(text)
         rows.append(cells)

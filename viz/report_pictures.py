@@ -22,7 +22,6 @@ from sdc_taichi.run.folder_reader import (
     read_run,
     read_steps,
 )
-from sdc_taichi.run.folder_writer import METRICS_FILE
 from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks, remarks_beside
 
 from . import dashboards, data_figures, figures, fleet_figures
@@ -108,21 +107,13 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
             ("cue_kg_per_kwh", min, "least carbon per IT energy"),
         ):
             known = [i for i, dc in enumerate(dcs) if dc["metrics"][key] is not None]
-            # Equal values tell nobody apart.
+            # Equal values single out no data center.
             if len({dcs[i]["metrics"][key] for i in known}) > 1:
-                found = best(known, key=lambda i: dcs[i]["metrics"][key])
-                reasons[found] = (
-                    f"{reasons[found]}, {text}" if found in reasons else f"it has the {text}"
-                )
+                dc = best(known, key=lambda i: dcs[i]["metrics"][key])
+                reasons[dc] = f"{reasons[dc]}, {text}" if dc in reasons else f"it has the {text}"
         reasons = reasons or {0: "hottest inlet, PUE and carbon are equal in all"}
     shown = list(reasons)
     parts = read_steps(run, shown), read_racks(run, shown), read_configs(run, shown)
-    for dc, racks, config in zip(shown, *parts[1:], strict=True):
-        if len(racks) != config.hall.racks:
-            raise SdcError(
-                f"{run.steps_path}: sdc_taichi_racks[{dc}]: {len(racks)} racks; valid is "
-                f"{config.hall.racks} as in its hall"
-            )
     return [
         ShownDataCenter(index, reason, steps, racks, config)
         for (index, reason), steps, racks, config in zip(reasons.items(), *parts, strict=True)
@@ -216,7 +207,7 @@ def _hot_racks_picture(run: RunFolder, dc: ShownDataCenter) -> str:
 
 
 def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
-    """The run by day and hour, or step by step; none of a run of a day or less."""
+    """Day-by-hour maps, or a step plot; empty for runs up to one day."""
     if run.hours >= YEAR_FROM_H:
         return picture_element(
             dashboards.year(steps, name),
@@ -275,14 +266,14 @@ def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dic
         names: names of the data centers.
         all_series: series of each data center.
     """
-    users: list[tuple[list[str], pd.Series]] = []
+    groups: list[tuple[list[str], pd.Series]] = []
     for name, values in zip(names, all_series, strict=True):
-        same = next((own for own, series in users if series.equals(values)), None)
+        same = next((group for group, series in groups if series.equals(values)), None)
         if same is None:
-            users.append(([name], values))
+            groups.append(([name], values))
         else:
             same.append(name)
-    return {", ".join(own): series for own, series in users}
+    return {", ".join(group): series for group, series in groups}
 
 
 _SAVED = {
@@ -291,7 +282,7 @@ _SAVED = {
     "cost": "energy_cost",
     "water": "water_l",
 }
-"""Columns of steps.parquet by the objectives of which days are told."""
+"""Column of steps.parquet that measures each objective, by which a day is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,9 +303,9 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
     """
     first = runs[0].metrics
     for run in runs:
-        found = find_optimum(run.path, first["fingerprint"], first["steps_done"])
-        if found is not None:
-            place, content = found
+        stored = find_optimum(run.path, first["fingerprint"], first["steps_done"])
+        if stored is not None:
+            place, content = stored
             best = run if place == run.path else read_run(place)
             names = [dc.get("name") for dc in content["data_centers"]]
             if names != runs[0].names or best.metrics["steps_done"] != first["steps_done"]:
@@ -324,7 +315,7 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
 
 
 def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]) -> str:
-    """Figures of an optimum, and its day beside that of the run.
+    """Table of an optimum, and the day on which it saves most beside that day of the run.
 
     Args:
         run: the run.
@@ -332,29 +323,25 @@ def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[Shown
         shown: data centers with pictures.
     """
     content = optimum.content
-    own = remarks_beside(run.metrics) if _beside_optimum(run, content) is not None else []
-    remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *own])))
+    of_run = remarks_beside(run.metrics) if _beside_optimum(run, content) is not None else []
+    remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *of_run])))
     parts = [*map(paragraph, remarks), _table(run, content)]
     if run.metrics["steps_done"] > 1:
         parts += [_day_picture(run, optimum, dc) for dc in shown]
     return "".join(parts)
 
 
-def shares_of(runs: Sequence[RunFolder], optimum: KnownOptimum) -> list[float | None]:
-    """Share of the achievable of each run; None where its files do not tell it.
+def share_of(run: RunFolder, optimum: KnownOptimum) -> float | None:
+    """Share of the achievable of a run; None where its files do not determine it.
 
     Where metrics.json does not hold it, a run that ends with no work waiting and has not used the
-    battery ends as it began, and its figure tells its share.
+    battery ends as it began, so its share follows from its figure.
 
     Args:
-        runs: the runs.
-        optimum: an optimum of the inputs of the first.
+        run: the run.
+        optimum: an optimum, which may be of other inputs.
     """
-    return [_share_of(run, optimum.content) for run in runs]
-
-
-def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
-    """Share of the achievable of a run."""
+    content = optimum.content
     if run.metrics["fingerprint"] != content["fingerprint"]:
         return None
     if run.metrics["controller"] == OPTIMUM and find_optimum(
@@ -377,22 +364,12 @@ def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
 
 
 def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What metrics.json says of an optimum of this objective, agents and steps; None if nothing.
-
-    Raises:
-        SdcError: it is damaged.
-    """
-    own = run.metrics.get("optimum")
-    if own is None:
+    """Entry of metrics.json about an optimum of this objective, agents and steps, if any."""
+    entry = run.metrics.get("optimum")
+    if entry is None:
         return None
-    lists = ("bound_kinds", "broken")
-    size = len(run.names)
-    if not isinstance(own, dict) or any(
-        not isinstance(own.get(name), list) or len(own[name]) != size for name in lists
-    ):
-        raise SdcError(f"{run.path / METRICS_FILE}: optimum is damaged; simulate the run again")
     decisive = ("objective", "agents", "scored_from")
-    return own if all(own.get(name) == content[name] for name in decisive) else None
+    return entry if all(entry.get(name) == content[name] for name in decisive) else None
 
 
 def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
@@ -415,9 +392,9 @@ def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
         return [name, *(format_number(v) if is_number(v) else DASH for v in values)]
 
     rows = []
-    for i, (dc, own) in enumerate(zip(dcs, run.metrics["data_centers"], strict=True)):
+    for i, (dc, of_run) in enumerate(zip(dcs, run.metrics["data_centers"], strict=True)):
         shares = (each["data_centers"][i].get("share") for each in controllers)
-        rows.append(row(dc["name"], dc, own["metrics"], shares))
+        rows.append(row(dc["name"], dc, of_run["metrics"], shares))
     caption = (
         f"Objective {content['objective']}: figures in {content['unit'].replace('CO2', 'CO₂')}, "
         "less is better; the gap between bound and achieved in % of idle; shares of the "
