@@ -210,14 +210,6 @@ def test_of_many_events_the_first_are_listed(folder: Path) -> None:
     assert "51 events that the run met, the first 40; all are in metrics.json" in page.text
 
 
-def test_times_of_long_runs_have_a_year(folder: Path) -> None:
-    run = read_run(folder / "greedy")
-    long = folder_reader.RunFolder(run.path, run.metrics | {"steps_done": 400 * 96})
-    moment = report_html.local_time(long, 0, 366 * 96)
-    assert report_html.time_text(long, moment) == "1 March (year 2) 00:00"
-    assert report_html.time_text(run, moment) == "1 March 00:00"
-
-
 def test_events_are_listed(page: Page) -> None:
     (row,) = page.rows(NASTY)
     assert row[1:] == ["heat wave", "", "+8 K", "28 February 12:00", "3", "48 to 59"]
@@ -359,11 +351,9 @@ def test_large_fleet_shows_extremes(fleet: Path) -> None:
         f"{number(worst['metrics']['pue'])} {worst['name']}",
         number(run.metrics["total"]["pue"]),
     ]
-    first, third = page.rows("1"), page.rows("3")
-    assert first[0][2] == f"{worst['name']}:\u00a0{number(worst['metrics']['pue'])}"
-    assert first[1][2] == f"{best['name']}:\u00a0{number(best['metrics']['pue'])}"
-    assert third[0][2].startswith(by_pue[-3]["name"])
-    assert first[0][5] == "all 0", "nothing was dropped, so nobody is ranked"
+    (first, _) = page.rows("1")
+    assert first[2] == f"{worst['name']}:\u00a0{number(worst['metrics']['pue'])}"
+    assert first[5] == "all 0", "nothing was dropped, so nobody is ranked"
 
 
 def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -386,13 +376,6 @@ def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPat
     assert worst["name"] in sections
     assert re.search(r"Shown because it has the [^.]*highest PUE[^.]* of 60\.", page.text)
     assert "The 40 hottest of 60 are shown." in page.text
-
-
-def test_equal_data_centers_are_not_told_apart(tmp_path: Path) -> None:
-    simulate(tmp_path / "run", make_configs(load_config("tiny"), count=6), 2)
-    (shown,) = report_pictures.shown_data_centers(read_run(tmp_path / "run"))
-    assert shown.index == 0
-    assert shown.reason == "hottest inlet, PUE and carbon are equal in all"
 
 
 def test_fleet_sums_and_maxima(fleet: Path) -> None:

@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.run.failover import DEVICES
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, I64, Reals, Status
+from sdc_taichi.types import F64, I64, QUANTITIES, Reals, Status
 
 from .hall_rasters import ColourScale
 from .recording_series import FIELD_ROWS
@@ -52,31 +53,29 @@ class LogEntry(NamedTuple):
 
 
 class _Condition(NamedTuple):
-    """State of a data center that lasts while a field exceeds a limit."""
+    """State of a data center that lasts while a quantity exceeds a limit."""
 
     field: str
-    """Field of ``StepResult``."""
+    """Name of the quantity."""
     limit: float
-    """Value that the field exceeds, in its unit."""
+    """Value that the quantity exceeds, in its unit."""
     level: str
     """Level of the first entry."""
-    begin_text: str
-    """Text of the first entry, with ``{value}`` and ``{place}`` of the hottest server."""
-    end_text: str
-    """Text of the last entry, with ``{most}`` and ``{total}`` of the field since the first one."""
-    factor: float = 1.0
-    """Unit of the field over the unit of the text."""
+    begin: str
+    """Begin of the first entry, which the value follows."""
+    end: str
+    """Begin of the last entry, which the highest value or the sum follows."""
+    is_summed: bool = False
+    """Whether the last entry has the sum since the first one."""
 
-
-def _inlet_condition(name: str, limit_c: float, level: str) -> _Condition:
-    """Inlets above the end of a range of temperatures."""
-    return _Condition(
-        "inlet_max_c",
-        limit_c + LEAST_EXCESS_K,
-        level,
-        f"inlet above {name} {limit_c:g} C: {{value:.1f}} C at {{place}}",
-        f"inlets back within {name} {limit_c:g} C, hottest was {{most:.1f}} C",
-    )
+    def value_text(self, value: float) -> str:
+        """A value of the quantity with its unit."""
+        unit = QUANTITIES[self.field].unit
+        if unit == "C":
+            return f"{value:.1f} C"
+        if unit == "W":
+            value, unit = value / 1e3, "kW"
+        return f"{value:{'.3g' if abs(value) < 100 else ',.0f'}} {unit}"
 
 
 CONDITIONS = (
@@ -84,54 +83,23 @@ CONDITIONS = (
         "unmet_w",
         1.0,
         "WARN",
-        "cooling plant at its limit: {value} kW of heat stay in the room",
-        "cooling plant below its limit again, {most} kW at the most",
-        factor=1e-3,
+        "cooling plant at its limit, heat stays in the room",
+        "cooling plant below its limit again",
     ),
-    _Condition(
-        "overdue_tasks",
-        1e-6,
-        "WARN",
-        "work overdue: {value} tasks found no capacity",
-        "no work overdue any more, {most} tasks at the most",
-    ),
-    _Condition(
-        "dropped_tasks",
-        1e-6,
-        "ERROR",
-        "work dropped: {value} tasks found the queue full",
-        "no work dropped any more, {total} tasks in all",
-    ),
-    _Condition(
-        "lost_tasks",
-        1e-6,
-        "ERROR",
-        "work lost: {value} tasks went down with their servers",
-        "no work lost any more, {total} tasks in all",
-    ),
+    _Condition("overdue_tasks", 1e-6, "WARN", "work overdue", "no work overdue any more"),
+    _Condition("dropped_tasks", 1e-6, "ERROR", "work dropped", "no work dropped any more", True),
+    _Condition("lost_tasks", 1e-6, "ERROR", "work lost", "no work lost any more", True),
     _Condition(
         "grid_overload_kwh",
         1e-9,
         "ERROR",
-        "grid connection overloaded: {value} kWh beyond its limit in the step",
-        "grid connection within its limit again, {total} kWh beyond it in all",
+        "grid connection overloaded, above its limit",
+        "grid connection within its limit again",
+        True,
     ),
-    _Condition(
-        "unserved_kwh",
-        1e-9,
-        "ERROR",
-        "energy unserved: {value} kWh",
-        "no energy unserved any more, {total} kWh in all",
-    ),
+    _Condition("unserved_kwh", 1e-9, "ERROR", "energy unserved", "no energy unserved now", True),
 )
 """Conditions of every data center, beside those of its inlets."""
-
-
-class _Number(float):
-    """A number that texts show with three digits, or all those before the point."""
-
-    def __format__(self, spec: str) -> str:
-        return super().__format__(spec or (".3g" if abs(self) < 100 else ",.0f"))
 
 
 @dataclass(slots=True)
@@ -141,9 +109,9 @@ class _Ongoing:
     first_step: int
     """Step in which the condition began, counted from 0 at reset."""
     most: float
-    """Highest value since, in the unit of the text."""
+    """Highest value since, in the unit of the quantity."""
     total: float
-    """Sum of the values since, in the unit of the text."""
+    """Sum of the values since, in the unit of the quantity."""
 
 
 class ConditionLog:
@@ -159,11 +127,20 @@ class ConditionLog:
         self._dc, self._per_row = dc, config.hall.racks_per_row
         self._step_h = 1.0 / fleet.steps_per_hour
         allowable_max_c = allowable_c(config.protection.ashrae_class)[1]
-        self._conditions = (
-            _inlet_condition("recommended", RECOMMENDED_C[1], "WARN"),
-            _inlet_condition("allowable", allowable_max_c, "ERROR"),
-            *CONDITIONS,
-        )
+        inlets = [
+            _Condition(
+                "inlet_max_c",
+                limit_c + LEAST_EXCESS_K,
+                level,
+                f"inlet above {name} {limit_c:g} C",
+                f"inlets back within {name} {limit_c:g} C",
+            )
+            for name, limit_c, level in (
+                ("recommended", RECOMMENDED_C[1], "WARN"),
+                ("allowable", allowable_max_c, "ERROR"),
+            )
+        ]
+        self._conditions = (*inlets, *CONDITIONS)
         self._rows = [FIELD_ROWS[c.field] for c in self._conditions]
         self._limits = np.array([c.limit for c in self._conditions])
         self._ongoing: dict[int, _Ongoing] = {}
@@ -194,32 +171,34 @@ class ConditionLog:
         """
         condition = self._conditions[index]
         for t, step in enumerate(steps.tolist()):
-            ongoing, now = self._ongoing.get(index), float(value[t]) * condition.factor
+            ongoing, now = self._ongoing.get(index), float(value[t])
             if over[t] and ongoing is None:
                 self._ongoing[index] = _Ongoing(step, now, now)
-                hottest = (
-                    values[t, FIELD_ROWS[name]] for name in ("hottest_rack", "hottest_server")
-                )
-                rack, server = map(int, hottest)
-                place = rack_place(rack, self._per_row, server)
-                text = condition.begin_text.format(value=_Number(now), place=place)
+                text = f"{condition.begin}: {condition.value_text(now)}"
+                if condition.field == "inlet_max_c":
+                    rack, server = (
+                        int(values[t, FIELD_ROWS[f"hottest_{part}"]]) for part in ("rack", "server")
+                    )
+                    text += f" at {rack_place(rack, self._per_row)}, server {server} from the floor"
                 yield LogEntry(step, self._dc, condition.level, text)
             elif over[t] and ongoing is not None:
                 ongoing.most = max(ongoing.most, now)
                 ongoing.total += now
             elif ongoing is not None:
                 hours = (step - ongoing.first_step) * self._step_h
-                text = condition.end_text.format(
-                    most=_Number(ongoing.most), total=_Number(ongoing.total)
+                amount = (
+                    f"{condition.value_text(ongoing.total)} in all"
+                    if condition.is_summed
+                    else f"{condition.value_text(ongoing.most)} at the most"
                 )
-                yield LogEntry(step, self._dc, "INFO", f"{text} (after {hours:g} h)")
+                text = f"{condition.end}, {amount} (after {hours:g} h)"
+                yield LogEntry(step, self._dc, "INFO", text)
                 del self._ongoing[index]
 
 
-def rack_place(rack: int, racks_per_row: int, server: int | None = None) -> str:
-    """Words for the place of a rack in its hall, or of a server in it; all count from 0."""
-    place = f"row {rack // racks_per_row}, rack {rack}"
-    return place if server is None else f"{place}, server {server} from the floor"
+def rack_place(rack: int, racks_per_row: int) -> str:
+    """Words for the place of a rack in its hall, counted from 0."""
+    return f"row {rack // racks_per_row}, rack {rack}"
 
 
 def protection_entries(
@@ -282,22 +261,12 @@ def failure_entries(
             yield LogEntry(step, event.dc, "INFO", f"over: {_event_text(event, fleet)}")
 
 
-_SHARE_LEFT: dict[str, str] = {
-    "chiller_derate": "chiller at {} of its capacity",
-    "pump_down": "{} of the chilled-water pumps left",
-    "tower_cell_down": "{} of the tower cells left",
-    "dry_cooler_down": "{} of the dry coolers left",
-    "outdoor_air_closed": "{} of the openings for outdoor air left",
-}
-"""Words for events that leave a share of a device of the plant, by their kind."""
-
-
 def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
     """Words for an event."""
     if event.kind == "crac_down":
         return "all CRAC units down" if event.target is None else f"CRAC unit {event.target} down"
-    if event.kind in _SHARE_LEFT:
-        return _SHARE_LEFT[event.kind].format(f"{event.share:.0%}")
+    if event.kind in DEVICES:
+        return f"{DEVICES[event.kind]}: {event.share:.0%} left"
     if event.kind == "rack_fan_failure":
         assert event.target is not None
         place = rack_place(event.target, fleet.configs[event.dc].hall.racks_per_row)

@@ -46,6 +46,15 @@ YEAR_FROM_H = 48.0
 """Length of a run from which it is drawn by day and hour, in h."""
 
 
+_SAVED = {
+    "carbon": "carbon_g",
+    "energy": "grid_kwh",
+    "cost": "energy_cost",
+    "water": "water_l",
+}
+"""Column of steps.parquet that measures each objective, by which a day is chosen."""
+
+
 @dataclass(frozen=True, slots=True)
 class ShownDataCenter:
     """A data center with pictures of its own."""
@@ -274,15 +283,6 @@ def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dic
         else:
             same.append(name)
     return {", ".join(group): series for group, series in groups}
-
-
-_SAVED = {
-    "carbon": "carbon_g",
-    "energy": "grid_kwh",
-    "cost": "energy_cost",
-    "water": "water_l",
-}
-"""Column of steps.parquet that measures each objective, by which a day is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
