@@ -166,15 +166,15 @@ def lines_of(frame: pd.DataFrame, group: str, name: str, columns: Sequence[str])
 def command_of(text: str) -> str:
     """A command line that runs a whole suite, without folders and where jobs run."""
     words = iter(with_ray_address(shlex.split(text)))
-    kept = []
+    shown = []
     for word in words:
         name, is_joined, _ = word.partition("=")
         if name in _ELSEWHERE:
             if not is_joined:
                 next(words, None)
         elif word not in ("--resume", "--quiet"):
-            kept.append(word)
-    return shlex.join(kept)
+            shown.append(word)
+    return shlex.join(shown)
 
 
 def made_by(suite: SuiteResults) -> str:

@@ -10,7 +10,8 @@ Of the residual the file keeps its standard deviation and its memory, and of the
 percentiles. See docs/data.md for what to add for a site of your own.
 
 The memory of a residual (keys w, ts, tf, tm and Phi) is read from the present coefficients.json
-where that has the quantity: those figures came from a numerical search that was not kept.
+where that has the quantity: those figures came from a numerical search whose program no longer
+exists.
 For what it lacks, or for all quantities with --refit, ``fit_memory`` finds w, ts and tf.
 
 --site fits that site alone and keeps the figures of all others, whose files are not needed then.
@@ -549,10 +550,10 @@ def fit(
 
 
 def _only(folder: Path, pattern: str) -> Path:
-    found = sorted(folder.glob(pattern))
-    if not found:
+    files = sorted(folder.glob(pattern))
+    if not files:
         raise FileNotFoundError(f"{folder}: no file {pattern}")
-    return found[0]
+    return files[0]
 
 
 def as_text(figures: Figures) -> str:
@@ -583,9 +584,9 @@ def main() -> None:
         help="fit this site alone; repeatable",
     )
     parser.add_argument("--refit", action="store_true", help="fit the memories of residuals too")
-    given = parser.parse_args()
-    figures = fit(given.folder, coefficients(), sites=given.site, refit=given.refit)
-    given.out.write_text(as_text(figures), "utf-8")
+    options = parser.parse_args()
+    figures = fit(options.folder, coefficients(), sites=options.site, refit=options.refit)
+    options.out.write_text(as_text(figures), "utf-8")
 
 
 if __name__ == "__main__":

@@ -160,9 +160,9 @@ def main() -> None:
     parser.add_argument("--sites", nargs="+", default=list(SITES))
     parser.add_argument("--weeks", nargs="+", type=int, default=list(HELD_OUT))
     parser.add_argument("--days", type=int, default=7)
-    given = parser.parse_args()
-    sites, days = given.sites, given.days
-    starts = [first_day(week) for week in given.weeks]
+    options = parser.parse_args()
+    sites, days = options.sites, options.days
+    starts = [first_day(week) for week in options.weeks]
     weeks, rich = data_centers(sites, starts), data_centers(sites, starts, FLEXIBLE)
     for text in season_tables(sites, days):
         print(text, "\n", flush=True)
@@ -170,8 +170,8 @@ def main() -> None:
     print(week_table("carbon, flexible", rich, sites, days), "\n", flush=True)
     print(week_table("bill", weeks, sites, days, objective="cost"), "\n", flush=True)
     print(week_table("carbon", weeks, sites, days, beside=HORIZONS), flush=True)
-    given.folder.mkdir(parents=True, exist_ok=True)
-    day_picture(given.folder / "optimum_day.png", "CA", days)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    day_picture(options.folder / "optimum_day.png", "CA", days)
 
 
 if __name__ == "__main__":
