@@ -21,7 +21,7 @@ from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import RunFolder, read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
-from sdc_taichi.run.steps_file import METADATA_KEY, AirAtStep
+from sdc_taichi.run.steps_file import METADATA_KEY
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
