@@ -170,6 +170,10 @@ class _Page:
         points = np.asarray(xy)
         return points[..., ::-1] if self.is_turned else points
 
+    def point(self, x: float, y: float) -> tuple[float, float]:
+        """A point of the room, in m, as coordinates on the page."""
+        return (y, x) if self.is_turned else (x, y)
+
     def box(self, x0: float, x1: float, y0: float, y1: float) -> npt.NDArray[Any]:
         """Corners of a rectangle of the room as coordinates on the page, (4, 2)."""
         return self.place([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
@@ -298,7 +302,7 @@ def _draw_aisles(axes: Axes, page: _Page) -> None:
         for y0, y1 in aisles:
             if (y1 - y0) * page.px_per_m[1] >= 13.0 and (x1 - x0) * page.px_per_m[0] >= 75.0:
                 axes.text(
-                    *page.place(((x0 + x1) / 2, (y0 + y1) / 2)), name, ha="center", va="center",
+                    *page.point((x0 + x1) / 2, (y0 + y1) / 2), name, ha="center", va="center",
                     fontsize=9, rotation=90 if page.is_turned else 0,
                     bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
                 )  # fmt: skip
@@ -327,10 +331,10 @@ def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
     )
     axes.add_collection(racks)
     if page.fits(*size_m, RACK_LABEL_PX):
-        for place, value in zip(page.place(plan.centre_m), shown.values, strict=True):
+        for (x, y), value in zip(plan.centre_m, shown.values, strict=True):
             ink = "black" if value > (low + high) / 2 else "white"
             text = f"{value:z.{shown.digits}f}"
-            axes.text(*place, text, color=ink, ha="center", va="center", fontsize=9)
+            axes.text(*page.point(x, y), text, color=ink, ha="center", va="center", fontsize=9)
     box, middle = boxes[shown.marked], boxes[shown.marked].mean(axis=0)
     if page.fits(*size_m, (16.0, 16.0)):
         axes.add_patch(Polygon(0.92 * box + 0.08 * middle, fill=False, edgecolor=SKY,
@@ -358,9 +362,9 @@ def _draw_units(axes: Axes, page: _Page, texts: Sequence[str], **style: Any) -> 
     for text, (x, y) in zip(texts, page.unit_places_m, strict=True):
         away = -deep_m if x == 0.0 else deep_m
         boxes.append(page.box(x, x + away, y - wide_m / 2, y + wide_m / 2))
-        axes.text(*page.place((x + away / 2, y)), text, ha="center", va="center", fontsize=7.5,
+        axes.text(*page.point(x + away / 2, y), text, ha="center", va="center", fontsize=7.5,
                   rotation=90 if "\n" in text and not page.is_turned else 0)  # fmt: skip
-    axes.add_collection(PolyCollection(boxes, **{"edgecolor": "black", "linewidth": 1.0} | style))
+    axes.add_collection(PolyCollection(boxes, edgecolor="black", **style))
 
 
 def _draw_design_units(axes: Axes, page: _Page, unit_m3s: F64) -> None:
@@ -370,7 +374,7 @@ def _draw_design_units(axes: Axes, page: _Page, unit_m3s: F64) -> None:
         texts = [f"CRAC {unit}\n{_airflow_text(m3s)} m³/s" for unit, m3s in enumerate(unit_m3s)]
     elif page.fits(*page.unit_m, (16.0, 12.0)):
         texts = [str(unit) for unit in range(len(unit_m3s))]
-    _draw_units(axes, page, texts, facecolor="#DDDDDD", label="CRAC unit")
+    _draw_units(axes, page, texts, facecolor="#DDDDDD", linewidth=1.0, label="CRAC unit")
 
 
 def _draw_failed_units(axes: Axes, page: _Page, study: Failover) -> None:
@@ -411,7 +415,7 @@ def _label_rows(axes: Axes, page: _Page) -> None:
     x = page.plan.row_ends_m[0] - 0.15 * margin_m
     for row in range(0, page.hall.rows, int(np.ceil(max(1.0, 22.0 / gap_px)))):
         axes.text(
-            *page.place((x, page.row_y_m[row])), f"row {row}" if gap_px > 40.0 else f"{row}",
+            *page.point(x, page.row_y_m[row]), f"row {row}" if gap_px > 40.0 else f"{row}",
             ha="center" if page.is_turned else "right",
             va="bottom" if page.is_turned else "center", fontsize=8, color=GREY,
         )  # fmt: skip
