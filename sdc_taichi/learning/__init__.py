@@ -1,8 +1,8 @@
-"""Learning: the algorithms of the paper, trainings, and trained policies.
+"""Reinforcement learning: the algorithms of the SustainDC paper, trainings, and trained policies.
 
-An algorithm acts in a stream of environments, learns from it, and returns networks. A policy
-consists of networks and the interface of the environments that it fits, and it is a controller.
-Training needs PyTorch; running a policy does not.
+An algorithm acts in a stream of environments, learns from the transitions, and returns networks. A
+policy consists of these networks and of the observation and action interface that they need.
+``controller.py`` runs a policy as a controller. Training needs PyTorch; running a policy does not.
 """
 
 from __future__ import annotations

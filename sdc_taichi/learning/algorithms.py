@@ -1,6 +1,6 @@
-"""The algorithms: their names, the properties in which they differ, and their settings.
+"""Learning algorithms: their names, the properties in which they differ, and their settings.
 
-PyTorch is not needed to read this module.
+This module does not import PyTorch.
 """
 
 from __future__ import annotations
@@ -14,21 +14,23 @@ Hidden = tuple[Annotated[int, Field(strict=True, ge=1, le=4096)], ...]
 
 
 class LearningSettings(BaseModel):
-    """Settings that all algorithms have: when a policy decides, and between what."""
+    """Settings that all algorithms have: interval of decisions, and levels to choose from."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     least_updates: ClassVar[int] = 2
-    """Fewest updates of a training; of two, the first only measures observations or returns."""
+    """Minimum number of updates of a training. It is 2 if the first update only measures
+    observations or returns."""
 
     decision_steps: Annotated[int, Field(strict=True, ge=1, le=96)] = 4
-    """Steps between two decisions of a policy, in which its actions are held."""
+    """Number of steps from one decision of a policy to the next; its actions are repeated in
+    between."""
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 7
-    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
-    Agrawal 2020); None is any number."""
+    """Number of equally spaced levels from -1 to 1 that a continuous action is chosen from (Tang
+    and Agrawal 2020); None allows any number."""
 
     def steps_per_update(self, episode_steps: int) -> int:
-        """Steps of each data center between two updates.
+        """Return the number of steps of each data center between two updates.
 
         Args:
             episode_steps: number of steps of an episode.
@@ -37,16 +39,17 @@ class LearningSettings(BaseModel):
 
 
 class ActingSettings(LearningSettings):
-    """Settings of how policies act while they learn."""
+    """Settings of algorithms that update a policy during an episode."""
 
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
-    """Decisions of each data center between two updates."""
+    """Number of decisions of each data center between two updates."""
     against_idle: bool = True
-    """Whether rewards are learned less those of idle commands in the same step of the same week,
-    as no action changes those; without effect where episodes begin on drawn days."""
+    """True to subtract from each reward the reward of idle commands in the same step of the same
+    week. No action changes that baseline. The setting has no effect if episodes begin on randomly
+    drawn days."""
 
     def steps_per_update(self, episode_steps: int) -> int:
-        """Steps of each data center between two updates."""
+        """Return the number of steps of each data center between two updates."""
         return self.rollout_decisions * self.decision_steps
 
 
@@ -54,33 +57,33 @@ class OnPolicySettings(ActingSettings):
     """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
 
     epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
-    """Passes over the steps of an update; ``haa2c`` makes one."""
+    """Number of passes (epochs) over the collected steps in each update; ``haa2c`` makes one."""
     mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
-    """Parts that the steps of an update are learned from in turn."""
+    """Number of mini-batches that the collected steps of an update are divided into."""
     rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
-    """Whether the learning rate falls to 0 in even steps over the training."""
+    """True if the learning rate falls linearly to 0 during the training."""
     discount: Share = 0.97
-    """Weight of a reward one decision later, gamma."""
+    """Discount factor gamma per decision."""
     gae_lambda: Share = 0.95
-    """Weight of later decisions in the advantage, lambda (Schulman et al. 2016)."""
+    """Parameter lambda of generalised advantage estimation (Schulman et al. 2016)."""
     clip: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Largest change of the probability ratio that pays, epsilon; ``haa2c`` has none."""
+    """Clipping range epsilon of the probability ratio; ``haa2c`` does not clip."""
     entropy: Annotated[float, Field(ge=0, le=10)] = 0.001
-    """Weight of the entropy of policies."""
+    """Weight of the policies' entropy in the objective."""
     gradient_norm: Annotated[float, Field(gt=0)] = 0.5
-    """Largest norm of a gradient of a network."""
+    """Maximum norm of a network's gradient; larger gradients are scaled down."""
     hidden: Hidden = (64, 64)
-    """Units of the hidden layers of policies and critics."""
+    """Number of units in each hidden layer of policies and critics."""
     activation: Literal["tanh", "relu"] = "tanh"
-    """Activation of all layers but the last."""
+    """Activation function of all layers except the last."""
     reward: Literal["own", "team"] | None = None
-    """Reward that critics learn: that of each learner, or that of all together over their number;
-    None is that of the algorithm's source."""
+    """Reward that critics learn: ``own`` is the reward of each learner, ``team`` the mean reward of
+    all learners; None selects the one in the publication of the algorithm."""
     critic: Literal["observation", "state"] | None = None
-    """Input of critics: what their learner observes, or the shared state; None is that of the
-    algorithm's source."""
+    """Input of critics: the observation of their learner, or the shared state; None selects the
+    one in the publication of the algorithm."""
 
 
 class OffPolicySettings(ActingSettings):
@@ -89,90 +92,92 @@ class OffPolicySettings(ActingSettings):
     least_updates: ClassVar[int] = 1
 
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 5
-    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from, of which the
-    critic values every combination; None is any number, for ``hasac``."""
+    """Number of equally spaced levels from -1 to 1 that a continuous action is chosen from; the
+    critic has a value for every combination of levels. None allows any number (``hasac`` only)."""
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
-    """Decisions of each data center between two updates."""
+    """Number of decisions of each data center between two updates."""
     gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 64
-    """Gradient steps of an update, each from a new batch."""
+    """Number of gradient steps in each update; each uses a new batch."""
     batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
-    """Transitions of a batch."""
+    """Number of transitions in a batch."""
     replay_size: Annotated[int, Field(strict=True, ge=1, le=100_000_000)] = 262_144
-    """Decisions of all data centers together that the replay holds; each takes four bytes for every
-    entry of the shared state and of the observations, in all 250 MB by default."""
+    """Capacity of the replay buffer: number of decisions, summed over all data centers. Each
+    decision takes four bytes for every entry of the shared state and of the observations, which
+    is 250 MB in total by default."""
     n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
-    """Decisions of a transition, n."""
+    """Number n of decisions that an n-step transition spans."""
     rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
-    """Whether the learning rate falls to 0 in even steps over the training."""
+    """True if the learning rate falls linearly to 0 during the training."""
     discount: Share = 0.97
-    """Weight of a reward one decision later, gamma."""
+    """Discount factor gamma per decision."""
     target_rate: Share = 0.005
-    """Share of the way to the critics that their slow copies go in a gradient step, tau."""
+    """Update rate tau of the target critics in each gradient step (Polyak averaging)."""
     gradient_norm: Annotated[float, Field(gt=0)] = 10.0
-    """Largest norm of a gradient of a network."""
+    """Maximum norm of a network's gradient; larger gradients are scaled down."""
     hidden: Hidden = (64, 64)
-    """Units of the hidden layers of policies and critics."""
+    """Number of units in each hidden layer of policies and critics."""
     activation: Literal["tanh", "relu"] = "relu"
-    """Activation of all layers but the last."""
+    """Activation function of all layers except the last."""
     exploration: Share = 0.05
-    """Lowest probability of a random choice, epsilon; of ``had3qn``."""
+    """Final probability epsilon of a random choice (``had3qn`` only)."""
     exploration_share: Share = 0.5
-    """Share of the training over which the probability of a random choice falls from 1; of
-    ``had3qn``."""
+    """Share of the training during which the probability of a random choice falls from 1 to
+    ``exploration`` (``had3qn`` only)."""
     temperature: Annotated[float, Field(gt=0, le=100)] = 0.01
-    """Weight of the entropy at the beginning, alpha; of ``hasac``."""
+    """Initial weight alpha of the entropy (``hasac`` only)."""
     temperature_rate: Annotated[float, Field(ge=0, le=1)] = 1e-3
-    """Learning rate of Adam for temperatures, 0 for constant ones; of ``hasac``."""
+    """Learning rate of Adam for temperatures; 0 keeps them constant (``hasac`` only)."""
     entropy_share: Share = 0.3
-    """Wanted entropy of choices as a share of the largest, the logarithm of their number; of
-    ``hasac``."""
+    """Target entropy of a discrete choice, divided by the maximum entropy, which is the logarithm
+    of the number of options (``hasac`` only)."""
     continuous_entropy: float = -1.0
-    """Wanted differential entropy of each continuous number, nats; log 2 is the largest; of
-    ``hasac``."""
+    """Target differential entropy of each continuous action, in nats; the maximum is log 2
+    (``hasac`` only)."""
 
 
 class CrossEntropySettings(LearningSettings):
     """Settings of ``cross-entropy``."""
 
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = None
-    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from, each by a
-    score of its own; None is any number."""
+    """Number of equally spaced levels from -1 to 1 that a continuous action is chosen from; the
+    policy has a score for each level. None allows any number."""
     candidates: Annotated[int, Field(strict=True, ge=2, le=100_000)] = 64
-    """Policies that are drawn in an update, at most as many as there are data centers."""
+    """Number of candidate policies drawn in each update; at most the number of data centers."""
     elite_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Share of the candidates that the distributions are fitted to."""
+    """Share of the candidates, best first, that the distributions are fitted to."""
     first_std: Annotated[float, Field(gt=0, le=100)] = 0.5
-    """Standard deviation of parameters at the beginning."""
+    """Initial standard deviation of the policy parameters."""
     noise_std: Annotated[float, Field(ge=0, le=100)] = 0.1
-    """Standard deviation that is added to those of the best candidates, falling to 0 in even steps
-    over the training."""
+    """Initial noise that is added to the standard deviations fitted to the best candidates; it
+    falls linearly to 0 during the training."""
     memory_rate: Annotated[float, Field(gt=0, le=1)] = 0.3
-    """Weight of the last episode in what returns of a data center are usual."""
+    """Weight of the latest episode in the moving average of a data center's returns."""
 
 
 class OnPolicyDefinition(NamedTuple):
-    """Properties in which algorithms that learn from their latest steps differ."""
+    """Properties in which the on-policy algorithms differ."""
 
     critic: Literal["observation", "state"]
-    """Input of critics: the observation of each learner, or the state that all share."""
+    """Input of critics: the observation of each learner, or the shared state."""
     reward: Literal["own", "team"]
-    """Reward that critics learn: that of each learner, or that of the team."""
+    """Reward that critics learn: the reward of each learner, or the mean reward of the team."""
     sequential: bool
-    """Whether learners are updated in random order, each weighted by the ratios of those before."""
+    """True if learners are updated one after another in random order, with advantages weighted by
+    the probability ratios of the learners that were updated before."""
     clips: bool
-    """Whether probability ratios are clipped, and steps used in several passes."""
+    """True if probability ratios are clipped and the collected steps are used in several passes."""
 
 
 class OffPolicyDefinition(NamedTuple):
-    """Properties in which algorithms that learn from a replay differ."""
+    """Properties in which the off-policy algorithms differ."""
 
     critics: int
-    """Number of critics, of which the lowest value counts."""
+    """Number of critics; the minimum of their values is used."""
     soft: bool
-    """Whether actions are drawn from policies that are rewarded for their entropy; otherwise the
-    action of the highest value is taken, and sometimes a random one."""
+    """True if actions are drawn from stochastic policies with an entropy bonus; False if the action
+    with the highest value is taken, with random exploration (epsilon-greedy)."""
 
 
 ON_POLICY: dict[str, OnPolicyDefinition] = {
@@ -182,12 +187,12 @@ ON_POLICY: dict[str, OnPolicyDefinition] = {
     "happo": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=True),
     "haa2c": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=False),
 }
-"""Algorithms that learn from the steps that their policies have just made, by name."""
+"""On-policy algorithms, which learn from the steps of their current policies, by name."""
 OFF_POLICY: dict[str, OffPolicyDefinition] = {
     "had3qn": OffPolicyDefinition(critics=1, soft=False),
     "hasac": OffPolicyDefinition(critics=2, soft=True),
 }
-"""Algorithms that learn from all steps that a replay holds, by name."""
+"""Off-policy algorithms, which learn from the steps in a replay buffer, by name."""
 LEARNING_SETTINGS: dict[str, type[LearningSettings]] = {
     **dict.fromkeys(ON_POLICY, OnPolicySettings),
     **dict.fromkeys(OFF_POLICY, OffPolicySettings),
@@ -197,7 +202,7 @@ LEARNING_SETTINGS: dict[str, type[LearningSettings]] = {
 
 
 def uses_state(name: str, settings: LearningSettings) -> bool:
-    """Whether critics of an algorithm take the shared state of all agents as input.
+    """Return True if an algorithm's critics take the shared state of all agents as input.
 
     Args:
         name: name of the algorithm.

@@ -1,6 +1,6 @@
-"""A policy as a controller: it observes, evaluates its networks, and decodes their actions.
+"""Controller that runs a trained policy: observe, evaluate the networks, decode their actions.
 
-Its commands equal those of an environment of its training with the same networks, to the bit.
+The commands are bit-identical to those in a training environment with the same networks.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from sdc_taichi.types import F32, I64, Actions
 
 
 class PolicyController:
-    """Controller by a policy; agents without a network act as in its training.
+    """Controller that runs a policy; agents without a network act as they did in the training.
 
     Args:
         policy: the policy.
         fleet: the data centers to control.
         name: name of the controller in messages.
-        others: controller of the agents without a network; None is that of the training.
+        others: name of the controller of the agents without a network; None selects the controller
+            that was used in the training.
 
     Attributes:
         policy: the policy.
-        commands: fields of ``Actions`` that it gives.
+        commands: fields of ``Actions`` that the controller sets.
 
     Raises:
         SdcError: the policy does not fit the data centers; the message names the difference.
@@ -49,7 +50,7 @@ class PolicyController:
         self._prepare(fleet)
 
     def __deepcopy__(self, _: Any) -> PolicyController:
-        """A new controller of the same policy, which is immutable."""
+        """Return a new controller with the same policy object (policies are immutable)."""
         return PolicyController(self.policy, self._fleet, self._name, self._named_others)
 
     def _prepare(self, fleet: Fleet) -> None:
@@ -68,7 +69,7 @@ class PolicyController:
         self.commands: tuple[str, ...] = (*decided, *self._by_others)
         self._observer: Observer | ReleasedObserver | None = None
         self._begun = False
-        # Actions of the last decision, which are held until the next one.
+        # Actions of the last decision, repeated until the next decision.
         self._actions: dict[str, F32 | I64] = {}
 
     def reset(self, seed: int | I64) -> None:
@@ -78,7 +79,7 @@ class PolicyController:
         self._actions = {}
 
     def act(self, view: View) -> Actions:
-        """Commands of the agents of the policy, and of the other agents as in its training.
+        """Return the policy's commands, together with those of the controller of other agents.
 
         Raises:
             SdcError: the policy does not fit the data centers.
@@ -98,7 +99,7 @@ class PolicyController:
         return Actions(**commands)
 
     def _observer_of(self, view: View) -> Observer | ReleasedObserver:
-        """The observer, reset at the beginning of the episode."""
+        """Return the observer, after a reset if the episode has just begun."""
         if self._observer is None:
             options = self.policy.interface.options()
             self._observer = make_observer(view.fleet, options, new_inputs=True)
@@ -109,21 +110,21 @@ class PolicyController:
 
 
 def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> PolicyController:
-    """The controller with the name ``policy:FOLDER``.
+    """Return the controller that is specified as ``policy:FOLDER``.
 
     Args:
         text: folder of a training or of a policy.
         fleet: the data centers to control.
-        parts: parts of a spec for which the name stands.
+        parts: agents (load, cooling, battery) that the spec assigns to this controller.
 
     Raises:
-        SdcError: the folder has no policy, or the policy is damaged or does not fit.
+        SdcError: the folder has no policy, or the policy is damaged or does not fit the fleet.
     """
     if not text:
         raise ConfigError("controller 'policy': valid is policy:FOLDER, such as policy:runs/happo")
     try:
         policy = Policy.load(Path(text))
-        # As a part of a spec, the policy gives its own commands alone.
+        # If the spec names further controllers, the policy sets only the commands of its agents.
         others = None if set(parts) == set(CONTROLLABLE) else "idle"
         return PolicyController(policy, fleet, f"policy {text}", others)
     except RecursionError:

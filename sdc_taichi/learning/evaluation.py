@@ -1,8 +1,11 @@
-"""Evaluation of controllers in weeks of the year, against idle commands and the optimum.
+"""Evaluation of controllers in weeks of the year, compared with idle commands and the optimum.
 
-All controllers begin in the same weeks and states. The first day of a week is run but not scored.
-Stored energy and waiting work at the end of a week have a value, so that an empty battery or
-postponed work is no saving.
+All controllers begin in the same weeks and states. The first day of each week is simulated but not
+scored. Stored energy and waiting work at the end of a week have a value, so that a controller gains
+nothing by emptying the battery or postponing work.
+
+A "figure" is the value of the objective over the scored steps (for ``carbon``, kg of CO2; lower is
+better). B is the number of data-center weeks.
 """
 
 from __future__ import annotations
@@ -45,23 +48,23 @@ if TYPE_CHECKING:
     import pandas as pd
 
 IDLE = "idle"
-"""Name of idle commands, with which all controllers are compared."""
+"""Name of the baseline controller, which gives no commands."""
 ALL = "all"
-"""Value of ``moves`` for a run in which a controller gives all its commands."""
+"""Value of column ``moves`` for a run in which all agents of a controller act."""
 METRICS = (
     *("cfp_kg", "grid_kwh", "it_kwh", "hvac_kwh", "water_l", "cost", "peak_kw"),
     *("over_27_degree_h", "hottest_inlet_c", "arrived_tasks", "executed_tasks", "dropped_tasks"),
     *("overdue_task_h", "queue_mean_tasks", "battery_throughput_kwh", "unmet_cooling_kwh"),
     *("lost_tasks", "throttled_rack_h", "tripped_rack_h", "unserved_kwh", "grid_overload_kwh"),
 )
-"""Metrics of ``run.metrics`` over the scored steps that each row holds."""
+"""Metrics of ``run.metrics`` that each row of an evaluation reports, over the scored steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class DataCenterWeeks:
     """Data centers in weeks of the year, with the figures of idle commands and of the optimum.
 
-    As a context manager it closes its simulator.
+    A ``with`` block closes the simulator at its end.
     """
 
     sim: Simulator
@@ -71,19 +74,19 @@ class DataCenterWeeks:
     weeks: tuple[int, ...]
     """Week of the year of each data center, 0..51, B."""
     objective: Objective
-    """Objective whose figure is compared; lower is better."""
+    """Objective by which controllers are compared; lower values are better."""
     steps: int
-    """Number of steps of a week that are run."""
+    """Number of simulated steps of each week."""
     scored_from: int
-    """First step that is scored."""
+    """Index of the first scored step."""
     seed: int
-    """Seed of sampled events, of controllers and of errors of forecasts."""
+    """Seed of sampled events, of controllers and of forecast errors."""
     forecast_error: ForecastError
     """Sizes of the errors of the forecasts that controllers get."""
     idle: F64
-    """Figure of idle commands over the scored steps, in the unit of the objective, (B,)."""
+    """Objective of idle commands over the scored steps, in the unit of the objective, (B,)."""
     optimum: Optimum | None
-    """Known optimum of the same weeks; None if it was not solved for."""
+    """Optimum of the same weeks; None if it was not computed."""
 
     def __enter__(self) -> Self:
         return self
@@ -93,7 +96,7 @@ class DataCenterWeeks:
 
     @property
     def strata(self) -> I64:
-        """Number of the site of each week, for the bootstrap, (B,)."""
+        """Index of the site of each data-center week, for the stratified bootstrap, (B,)."""
         names = list(dict.fromkeys(self.sites))
         return np.array([names.index(site) for site in self.sites], dtype=np.int64)
 
@@ -102,12 +105,13 @@ class Validation(NamedTuple):
     """Result of a controller over all validation weeks together."""
 
     change_pct: float
-    """Change of the figure against idle commands, in %; with an optimum, the figure includes the
-    value of energy and work left at the end."""
+    """Change of the objective relative to idle commands, in %; if the optimum is known, the
+    objective includes the value of energy and work left at the end."""
     share: float
-    """Share of the achievable; nan without an optimum."""
+    """Saving of the controller divided by the saving of the optimum's achieved path, both relative
+    to idle commands; nan without an optimum."""
     broken_weeks: int
-    """Number of weeks that break a constraint of the optimum; 0 without an optimum."""
+    """Number of weeks that violate a constraint of the optimum; 0 without an optimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +119,13 @@ class Contender:
     """A controller to evaluate."""
 
     name: str
-    """Name of the controller in the tables; trainings of one name share a row."""
+    """Name of the controller in the tables; trainings with the same name share a table row."""
     controller: Controller
-    """Controller that is run."""
+    """Controller to run."""
     seed: int | None = None
     """Seed of the training of the controller; None if it was not trained."""
     agents: tuple[str, ...] = ()
-    """Agents (load, cooling, battery) that are also run one at a time, the others idle."""
+    """Agents (load, cooling, battery) that also run one at a time while the others are idle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,16 +133,17 @@ class Evaluation:
     """Figures and metrics of controllers in each data-center week."""
 
     rows: pd.DataFrame
-    """A row for each controller, training, moved agent and data-center week, with the columns
-    ``controller``, ``training``, ``moves``, ``site``, ``week``, ``figure``, ``valued_figure``,
-    ``idle_figure``, ``achieved_figure``, ``share``, ``broken`` and those of ``METRICS``."""
+    """Table with a row for each controller, training, set of acting agents and data-center week.
+    Its columns are ``controller``, ``training``, ``moves``, ``site``, ``week``, ``figure``,
+    ``valued_figure``, ``idle_figure``, ``achieved_figure``, ``share``, ``broken`` and the names in
+    ``METRICS``."""
     objective: Objective
     """Objective of the figures."""
     alone: dict[str, F64]
-    """Figures of the optimum of each agent alone, by agent, in each week, (B,) each; empty without
-    an optimum."""
+    """Optimal objective of each week if only one agent acts, (B,), by agent; empty without an
+    optimum."""
     strata: I64
-    """Number of the site of each week, (B,)."""
+    """Index of the site of each data-center week, (B,)."""
     missing: tuple[str, ...]
     """Names of the runs that did not finish before ``stop`` returned true."""
 
@@ -158,23 +163,23 @@ def prepare(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> DataCenterWeeks:
-    """Build the data centers of all weeks, and compute the figures of idle commands and optimum.
+    """Build the data centers of all weeks; compute the objective of idle commands and optimum.
 
     Args:
         configs: data centers, such as one for each site.
         weeks: weeks of the year, 0..51.
-        objective: objective to compare, or its text.
-        optimum: whether to solve for the optimum, which gives the value of energy and work left at
-            the end, and the share of the achievable.
-        exact_ends: whether to solve a programme for the value of each run's end, which takes about
-            a second per week, rather than to interpolate it from curves.
-        days: days of each week to run, 2..7; the first is not scored.
+        objective: objective by which controllers are compared, or its text, such as ``carbon``.
+        optimum: whether to compute the optimum, which gives the value of energy and work left at
+            the end, and the share of the achievable saving.
+        exact_ends: True to value energy and work left at the end of each run by a linear programme,
+            which takes about a second per week; False to interpolate the value from curves.
+        days: days of each week to run, 2..7; the first day is not scored.
         seed: seed of sampled events, controllers and forecast errors.
         forecast_error: sizes of the errors of the controllers' forecasts.
         precision: precision of the server kernels.
-        cache: whether to read and write optima in the user's cache, or a folder for them.
-        progress: progress callback ``(stage, done, total)`` of solving.
-        stop: called repeatedly; true ends the work.
+        cache: whether to read and write optima in the user's cache, or the folder to use instead.
+        progress: progress callback ``(stage, done, total)`` of the optimiser.
+        stop: called repeatedly; the computation ends when it returns true.
 
     Raises:
         ConfigError: there are no data centers or weeks, or an argument is not valid.
@@ -207,7 +212,7 @@ def prepare(
             if not exact_ends:
                 best = with_tabled_ends(best, sim, progress=progress, stop=stop)
         idle = np.empty(0) if best is None else best.idle
-        made = DataCenterWeeks(
+        prepared = DataCenterWeeks(
             sim=sim,
             sites=tuple(config.name for config in sites for _ in numbers),
             weeks=numbers * len(sites),
@@ -220,11 +225,11 @@ def prepare(
             optimum=best,
         )
         if best is None:
-            score, is_whole = _run(made, Idle(), stop=stop)
+            score, is_whole = _run(prepared, Idle(), stop=stop)
             if not is_whole:
                 raise StoppedError("idle commands are not run to the end, nothing is kept")
-            made = replace(made, idle=score.figure)
-        return made
+            prepared = replace(prepared, idle=score.figure)
+        return prepared
     except BaseException:
         sim.close()
         raise
@@ -251,7 +256,7 @@ def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
 
 
 def check_contenders(contenders: Iterable[Contender]) -> None:
-    """Check that the rows of controllers can be distinguished, and that their agents exist.
+    """Check that name and seed identify each controller, and that the agents exist.
 
     Args:
         contenders: the controllers.
@@ -283,16 +288,17 @@ def evaluate(
     on_run: Callable[[str], Callable[[StepResult], None] | None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Evaluation:
-    """Run controllers in the same weeks.
+    """Run each controller in the same weeks, and return a row for each run and week.
 
     Args:
         weeks: the weeks.
         contenders: the controllers.
         beside: whether to add rows of idle commands at the beginning and, with an optimum, rows of
             its achieved path at the end.
-        on_run: called with the name of each run before it begins; returns a function that is called
-            with the result of every step, or None.
-        stop: called before every step; true ends the evaluation, and rows of finished runs remain.
+        on_run: called with the name of each run before the run begins; it may return a function
+            that is then called with the result of every step.
+        stop: called before every step; if it returns true, the evaluation ends, and the result has
+            the rows of the finished runs.
 
     Raises:
         ConfigError: ``check_contenders`` refuses a name or an agent.
@@ -332,7 +338,7 @@ def evaluate(
 def _runs(
     weeks: DataCenterWeeks, contenders: Iterable[Contender], *, beside: bool
 ) -> list[tuple[str, str, Contender]]:
-    """Name, moved agents and controller of each run, in the order of the rows."""
+    """Return run name, value of column ``moves`` and contender of each run, in row order."""
     listed = list(contenders)
     check_contenders(listed)
     if beside:
@@ -353,7 +359,7 @@ def _rows(
     on_step: Callable[[StepResult], None] | None,
     stop: Callable[[], bool] | None,
 ) -> pd.DataFrame | None:
-    """A row for each data-center week; None if the run was stopped."""
+    """Run a controller and return a row for each data-center week; None if it was stopped."""
     import pandas as pd
 
     totals = empty_totals(weeks.sim.size, weeks.sim.step_h)
@@ -399,7 +405,7 @@ def _run(
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> tuple[Score, bool]:
-    """Score of a run through the weeks, and whether it came to its end."""
+    """Return the score of a run through the weeks, and True if the run was not stopped early."""
     if weeks.optimum is None:
         weeks.sim.reset(weeks.seed)
         score = Score(weeks.objective, weeks.sim, weeks.scored_from)
@@ -424,7 +430,7 @@ def _run(
 
 
 def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
-    """Settings of the first of several trainings; None if no folder holds a training.
+    """Return the settings of the first training; None if the folders hold policies only.
 
     Args:
         folders: folders of trainings or policies.
@@ -447,7 +453,7 @@ def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
 def contenders_of(
     folders: Sequence[Path], fleet: Fleet, *, agents_alone: bool = True
 ) -> list[Contender]:
-    """Policies of trainings as contenders; trainings that differ only in their seed share a name.
+    """Return trained policies as contenders; trainings that differ only in seed share a name.
 
     Args:
         folders: folders of trainings or policies.
@@ -470,19 +476,19 @@ def contenders_of(
 
 
 def _key(folder: Path, policy: Policy) -> str:
-    """Text that is equal for trainings that differ only in their seed."""
+    """Return a text that is equal for two trainings if they differ only in their seed."""
     about = policy.about.model_dump(exclude={"seed", "fingerprint"})
     settings = {}
     if (folder / SETTINGS_FILE).is_file():
         settings = settings_of(folder).model_dump(mode="json", exclude={"seed"})
-        about.pop("steps")  # the best policies of seeds come from different updates
+        about.pop("steps")  # differs by seed: the best policy may come from any update
     return json.dumps([about, policy.interface.model_dump(), settings], sort_keys=True)
 
 
 def _names(
     folders: Sequence[Path], policies: Sequence[Policy], keys: Sequence[str]
 ) -> dict[str, str]:
-    """Name of each key: its algorithm, or its folder if several keys have that algorithm."""
+    """Return a name for each key: its algorithm, or its folder if keys share the algorithm."""
     first = {key: i for i, key in reversed(list(enumerate(keys)))}
     algorithms = [policies[i].about.algorithm for i in first.values()]
     names: dict[str, str] = {}

@@ -1,7 +1,8 @@
-"""Policies as ONNX graphs, for runtimes that know nothing of this package.
+"""Export of policies as ONNX graphs, which run without this package.
 
-Inputs are the observations of each agent by its name, f32 (batch, n), as environments give them;
-outputs are ``AGENT_action``, (batch, k), and ``AGENT_scores``, the outputs of the last layer.
+The graph has one input per agent, named after the agent: its unnormalised observations, f32
+(batch, n). For each agent it has the outputs ``AGENT_action``, (batch, k), and ``AGENT_scores``,
+which are the outputs of the network's last layer.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.policy import Policy, PolicyNetwork, action_levels
 
 OPSET = 17
-"""Version of ONNX's operators."""
+"""Version of the ONNX operator set."""
 _IR_VERSION = 8
 
 
 def export_onnx(policy: Policy, path: Path) -> None:
-    """Write a policy as an ONNX model, with its interface, origin and decision steps as metadata.
+    """Write a policy as an ONNX model; interface, origin and decision steps become metadata.
 
     Args:
         policy: the policy.
@@ -55,7 +56,7 @@ def export_onnx(policy: Policy, path: Path) -> None:
 
 
 def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetwork) -> None:
-    """Nodes from the observations of a network's agents to their actions."""
+    """Add the nodes that map the observations of a network's agents to their actions."""
     parts = [
         graph.columns(agent, np.arange(policy.interface.width(agent))[entries])
         for agent, entries in policy.entries[number].items()
@@ -83,7 +84,7 @@ def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetw
 
 
 def _actions(graph: _Graph, network: PolicyNetwork, scores: str, discrete: bool) -> str:
-    """Actions of a network from its outputs."""
+    """Add the nodes that map a network's outputs to its actions; return the value's name."""
     if network.head == "argmax":
         shape = graph.constant(
             np.array([-1, network.action_width, network.choices], dtype=np.int64)
@@ -96,16 +97,16 @@ def _actions(graph: _Graph, network: PolicyNetwork, scores: str, discrete: bool)
 
 
 def _between(graph: _Graph, x: str, most: float) -> str:
-    """Values cut at ``-most`` and ``most``."""
+    """Add a node that clips a value to -``most``..``most``; return the result's name."""
     low, high = (graph.constant(np.float32(limit)) for limit in (-most, most))
     return graph.node("Clip", x, low, high)
 
 
 class _Graph:
-    """A graph under construction; values are known by their names.
+    """ONNX graph under construction; each method refers to values by their names.
 
     Args:
-        onnx: the module.
+        onnx: the imported module ``onnx``.
     """
 
     def __init__(self, onnx: Any) -> None:
@@ -120,28 +121,28 @@ class _Graph:
         self._inputs.append(self._value(name, width, np.float32))
 
     def add_output(self, name: str, source: str, width: int, kind: Any) -> None:
-        """Add an output, (batch, width), that is a value by another name."""
+        """Add an output ``name``, (batch, width), that equals the value ``source``."""
         self._nodes.append(self._onnx.helper.make_node("Identity", [source], [name]))
         self._outputs.append(self._value(name, width, kind))
 
     def constant(self, values: npt.ArrayLike) -> str:
-        """Name of a constant."""
+        """Add a constant and return its name."""
         name = f"constant_{len(self._constants)}"
         self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(values), name))
         return name
 
     def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Name of the output of an operator."""
+        """Add an operator and return the name of its output."""
         name = f"value_{len(self._nodes)}"
         self._nodes.append(self._onnx.helper.make_node(kind, inputs, [name], **attributes))
         return name
 
     def columns(self, source: str, numbers: npt.NDArray[np.int64]) -> str:
-        """Name of some columns of a value."""
+        """Add a node that selects columns of a value; return the result's name."""
         return self.node("Gather", source, self.constant(numbers.astype(np.int64)), axis=1)
 
     def model(self, metadata: dict[str, Any]) -> Any:
-        """The model with its metadata, checked."""
+        """Return the checked model with its metadata."""
         helper = self._onnx.helper
         graph = helper.make_graph(
             self._nodes, "policy", self._inputs, self._outputs, self._constants

@@ -1,8 +1,9 @@
-"""Weeks of the year that policies are trained in, chosen by, and shown by.
+"""Split of the year's weeks into training, validation and held-out weeks.
 
-Every fourth week is held out: nothing is chosen by it. Validation weeks decide which checkpoint or
-setting is best. Agents learn in the others. Forecasts of the last day of a week read ahead into the
-first day of the next, so that day is run but not scored.
+Agents learn in the training weeks. Validation weeks decide which checkpoint or setting is best.
+Every fourth week is held out for the final results and takes no part in any choice. Forecasts on
+the last day of a week contain data of the next week's first day, so the first day of each week is
+simulated but not scored.
 """
 
 from __future__ import annotations
@@ -18,26 +19,26 @@ WEEKS = 52
 """Number of whole weeks of a year."""
 DAYS_PER_WEEK = 7
 UNSCORED_DAYS = 1
-"""Days at the beginning of a week that are run but not scored."""
+"""Number of days at the beginning of each week that are simulated but not scored."""
 HELD_OUT = tuple(range(3, WEEKS, 4))
-"""Weeks that results are shown for."""
+"""Test weeks of the year, 0..51, in which results are reported."""
 VALIDATION = tuple(range(1, WEEKS, 8))
-"""Weeks that choices are made by."""
+"""Weeks of the year, 0..51, by which checkpoints and settings are chosen."""
 TRAINING = tuple(week for week in range(WEEKS) if week not in {*HELD_OUT, *VALIDATION})
-"""Weeks that agents learn in."""
+"""Weeks of the year, 0..51, in which agents learn."""
 NAMED_WEEKS: Mapping[str, tuple[int, ...]] = {
     "held-out": HELD_OUT,
     "validation": VALIDATION,
     "training": TRAINING,
 }
-"""Parts of the year by name."""
+"""Weeks of each part of the split, by name."""
 
 
 def parse_weeks(text: str) -> tuple[int, ...]:
-    """Weeks of the year from a name such as ``held-out``, or from numbers such as ``3,7,11``.
+    """Return weeks of the year from a name such as ``held-out``, or numbers such as ``3,7,11``.
 
     Raises:
-        ConfigError: an unknown name, a number that is no week, or one that is given twice.
+        ConfigError: the name is unknown, a number is not a week, or a week is repeated.
     """
     if text.strip() in NAMED_WEEKS:
         return NAMED_WEEKS[text.strip()]
@@ -54,21 +55,21 @@ def parse_weeks(text: str) -> tuple[int, ...]:
 
 
 def first_day(week: int) -> str:
-    """First day of a week of the year, 0..51, as ``MM-DD``."""
+    """Return the first day, as ``MM-DD``, of a week of the year, 0..51."""
     return f"{date(2001, 1, 1) + timedelta(days=DAYS_PER_WEEK * week):%m-%d}"
 
 
 def data_center_weeks(
     configs: Iterable[DataCenterConfig], weeks: Sequence[int]
 ) -> list[DataCenterConfig]:
-    """One data center for each of several and each week, named ``NAME-WEEK``.
+    """Return a copy of each data center for each week, named ``NAME-WEEK``.
 
     Args:
         configs: the data centers, such as one for each site.
-        weeks: weeks of the year, 0..51.
+        weeks: weeks of the year, 0..51, in which the copies begin.
 
     Returns:
-        Their copies, data center by data center.
+        All weeks of the first data center, then all weeks of the second, and so on.
     """
     return [
         config.model_copy(

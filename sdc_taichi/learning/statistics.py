@@ -1,10 +1,11 @@
-"""Statistics of controllers that ran in the same weeks, some of them trained from several seeds.
+"""Statistics of controllers that ran in the same weeks; some are trained with several seeds.
 
-A sample is an array (S, W) of figures, by S trainings and W data-center weeks; a controller that is
-not trained has one training. Intervals come from a bootstrap (Efron 1979) that draws trainings
-whole, and weeks within each site, the same for all samples, so that differences are paired.
-Interquartile mean, probability of improvement and performance profiles are those of Agarwal et al.
-(2021, "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 34).
+A sample is an array of objective values, shape (S, W), for S trainings (seeds) and W data-center
+weeks; S is 1 for a controller without training. Intervals come from a bootstrap (Efron 1979) that
+resamples whole trainings, and weeks within each site. The same weeks are drawn for all samples, so
+that differences are paired. Interquartile mean, probability of improvement and performance profiles
+follow Agarwal et al. (2021, "Deep reinforcement learning at the edge of the statistical precipice",
+NeurIPS 34).
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64, I64
 
 DRAWS = 2000
-"""Number of samples that a bootstrap draws."""
+"""Default number of bootstrap resamples."""
 
 
 class Interval(NamedTuple):
-    """A statistic of samples, and an interval around it."""
+    """Value of a statistic and its confidence interval."""
 
     value: float
-    """Statistic of the samples themselves."""
+    """Statistic of the samples without resampling."""
     low: float
     """Lower end of the interval, in the unit of the statistic."""
     high: float
     """Upper end of the interval, in the unit of the statistic."""
 
     def columns(self, name: str) -> dict[str, float]:
-        """Columns of a table with the value and both ends.
+        """Return table columns with the value and both ends of the interval.
 
         Args:
-            name: column of the value; those of the ends are ``NAME_low`` and ``NAME_high``.
+            name: column of the value; the ends have the columns ``NAME_low`` and ``NAME_high``.
         """
         return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
 
 
 Statistic = Callable[..., F64]
-"""Function of samples, (..., S, W) each, that returns a number for each of the leading axes."""
+"""Function of samples, shape (..., S, W) each, that returns an array of shape (...)."""
 
 
 def bootstrap_interval(
@@ -54,16 +55,17 @@ def bootstrap_interval(
     level: float = 0.95,
     paired: bool = False,
 ) -> Interval:
-    """A statistic of samples with its percentile interval by a stratified bootstrap.
+    """Return a statistic of samples with its percentile interval by a stratified bootstrap.
 
     Args:
         statistic: function of the samples.
-        samples: samples that are paired by their weeks, (S, W) each, of any S.
-        strata: stratum of each week, (W,); weeks are drawn within their stratum.
-        generator: draws.
-        draws: number of draws.
-        level: share of the draws inside the interval.
-        paired: whether samples are also paired by their trainings, as when seeds decide inputs.
+        samples: samples that share their weeks, (S, W) each; S may differ between samples.
+        strata: stratum of each week, (W,); weeks are resampled within their stratum.
+        generator: random generator of the bootstrap.
+        draws: number of bootstrap resamples.
+        level: confidence level, 0..1.
+        paired: True to resample the same trainings in all samples with the same S, which is needed
+            if the seed of a training also determines its inputs.
 
     Raises:
         ConfigError: a sample and the strata have different numbers of weeks.
@@ -81,17 +83,17 @@ def bootstrap_values(
     *,
     paired: bool = False,
 ) -> F64:
-    """Values of a statistic over bootstrap draws of weeks and of trainings.
+    """Return the values of a statistic for bootstrap resamples of weeks and trainings.
 
     Args:
         statistic: function of the samples.
-        samples: samples that are paired by their weeks, (S, W) each, of any S.
-        weeks: numbers of the weeks of each draw, of ``drawn_weeks``, (draws, W).
-        generator: source of the draws of trainings.
-        paired: whether the same trainings are drawn from all samples of equal size.
+        samples: samples that share their weeks, (S, W) each; S may differ between samples.
+        weeks: week indices of each resample, from ``drawn_weeks``, (draws, W).
+        generator: random generator that draws the trainings.
+        paired: True to resample the same trainings in all samples with the same S.
 
     Returns:
-        The values, (draws,).
+        Value of the statistic for each resample, (draws,).
 
     Raises:
         ConfigError: a sample has another number of weeks.
@@ -110,12 +112,12 @@ def bootstrap_values(
 
 
 def percentile_interval(value: float, drawn: F64, level: float = 0.95) -> Interval:
-    """The interval that holds a share of the values of a bootstrap, with equal tails.
+    """Return the percentile interval of bootstrap values, with equal tails.
 
     Args:
-        value: statistic of the samples themselves.
-        drawn: values of the draws, (draws,).
-        level: share of the draws inside the interval.
+        value: statistic of the samples without resampling.
+        drawn: values of the bootstrap resamples, (draws,).
+        level: confidence level, 0..1.
     """
     tail = 50.0 * (1.0 - level)
     low, high = np.percentile(drawn, [tail, 100.0 - tail])
@@ -123,23 +125,25 @@ def percentile_interval(value: float, drawn: F64, level: float = 0.95) -> Interv
 
 
 def change_pct(figures: F64, idle: F64) -> F64:
-    """Change of the sum over all weeks against that of idle commands, in %.
+    """Return the change of the objective relative to idle commands, summed over all weeks, in %.
 
     Args:
-        figures: of a controller, (..., S, W).
-        idle: of idle commands, (..., 1, W).
+        figures: objective of a controller, (..., S, W).
+        idle: objective of idle commands, (..., 1, W).
     """
     ratio = figures.mean(axis=-2).sum(axis=-1) / idle.mean(axis=-2).sum(axis=-1)
     return np.asarray(100.0 * (ratio - 1.0))
 
 
 def share_pct(figures: F64, idle: F64, achieved: F64) -> F64:
-    """Share of the achievable over all weeks together, in %.
+    """Return the saving of a controller as a share of the achievable saving, in %.
+
+    Both savings are relative to idle commands and summed over all weeks.
 
     Args:
-        figures: of a controller, (..., S, W).
-        idle: of idle commands, (..., 1, W).
-        achieved: of the optimum's achieved path, (..., 1, W).
+        figures: objective of a controller, (..., S, W).
+        idle: objective of idle commands, (..., 1, W).
+        achieved: objective of the optimum's achieved path, (..., 1, W).
     """
     total, base, best = (x.mean(axis=-2).sum(axis=-1) for x in (figures, idle, achieved))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -147,21 +151,21 @@ def share_pct(figures: F64, idle: F64, achieved: F64) -> F64:
 
 
 def sample_mean(values: F64) -> F64:
-    """Mean of all values of a sample, trainings and weeks alike.
+    """Return the mean of a sample over all trainings and weeks, shape (...).
 
     Args:
-        values: (..., S, W).
+        values: samples, (..., S, W).
     """
     return np.asarray(values.mean(axis=(-2, -1)))
 
 
 def interquartile_mean(values: F64) -> F64:
-    """Mean of the middle half of a sample's values, trainings and weeks alike.
+    """Return the interquartile mean of a sample over all trainings and weeks, shape (...).
 
-    A quarter of them, rounded down, is left out at each end.
+    A quarter of the values, rounded down, is left out at each end.
 
     Args:
-        values: (..., S, W).
+        values: samples, (..., S, W).
     """
     flat = np.sort(values.reshape(*values.shape[:-2], -1), axis=-1)
     cut = flat.shape[-1] // 4
@@ -169,13 +173,14 @@ def interquartile_mean(values: F64) -> F64:
 
 
 def probability_of_improvement(figures: F64, others: F64) -> F64:
-    """Probability that a training has the lower figure in a week, mean over the weeks, 0..1.
+    """Return the probability, 0..1, that one controller has a lower objective than another.
 
-    Equal figures count half, as in the test of Mann and Whitney (1947).
+    The probability is the mean over all weeks and all pairs of trainings. Equal values count half,
+    as in the test of Mann and Whitney (1947).
 
     Args:
-        figures: of a controller, (..., S, W).
-        others: of another controller, (..., R, W).
+        figures: objective of the one controller, (..., S, W).
+        others: objective of the other controller, with R trainings, (..., R, W).
     """
     mine, theirs = figures[..., :, None, :], others[..., None, :, :]
     better = (mine < theirs) + 0.5 * (mine == theirs)
@@ -184,14 +189,14 @@ def probability_of_improvement(figures: F64, others: F64) -> F64:
 
 
 def performance_profile(scores: F64, thresholds: F64) -> F64:
-    """Share of all trainings and weeks whose score is above each of several thresholds, 0..1.
+    """Return the share, 0..1, of all trainings and weeks with a score above each threshold.
 
     Args:
-        scores: more is better, (..., S, W); nan is left out.
-        thresholds: of the score, (T,).
+        scores: scores, higher is better, (..., S, W); nan values are left out.
+        thresholds: thresholds of the score, (T,).
 
     Returns:
-        Shares, (..., T); nan where no score is known.
+        Shares, (..., T); nan if all scores are nan.
     """
     flat = scores.reshape(*scores.shape[:-2], 1, -1)
     known = np.isfinite(flat).sum(axis=-1)
@@ -201,12 +206,12 @@ def performance_profile(scores: F64, thresholds: F64) -> F64:
 
 
 def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int = DRAWS) -> I64:
-    """Numbers of weeks, drawn with replacement within each stratum, (draws, W).
+    """Return indices of weeks, drawn with replacement within each stratum, (draws, W).
 
     Args:
         strata: stratum of each week, (W,).
-        generator: draws.
-        draws: number of draws.
+        generator: random generator of the bootstrap.
+        draws: number of bootstrap resamples.
     """
     weeks = np.empty((draws, len(strata)), dtype=np.int64)
     for stratum in np.unique(strata):
