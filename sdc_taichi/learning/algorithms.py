@@ -80,7 +80,7 @@ class OnPolicySettings(ActingSettings):
     """Activation function of all layers except the last."""
     reward: Literal["own", "team"] | None = None
     """Reward that critics learn: ``own`` is the reward of each learner, ``team`` the mean reward of
-    all learners; None selects the one in the publication of the algorithm."""
+    all learning agents; None selects the one in the publication of the algorithm."""
     critic: Literal["observation", "state"] | None = None
     """Input of critics: the observation of their learner, or the shared state; None selects the
     one in the publication of the algorithm."""

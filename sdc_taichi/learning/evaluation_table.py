@@ -1,8 +1,8 @@
-"""Tables of an evaluation, by controller, site, agent and pair, and the folder they are written to.
+"""Result tables of an evaluation (by controller, site, agent, and pair), and their output folder.
 
-Figures include the value of stored energy and waiting work at the end if there is an optimum, which
-gives that value. Intervals are those of ``statistics.bootstrap_interval``, with the same draws for
-all rows.
+A "figure" is the value of the objective. If the optimum is known, it also determines the value of
+stored energy and waiting work at the end, which the figures then include. Confidence intervals are
+those of ``statistics.bootstrap_interval``, with the same random draws for all rows of a table.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _SEED = 0
-"""Seed of the draws of intervals."""
+"""Seed of the bootstrap for confidence intervals."""
 _AGAINST_IDLE = {
     "carbon_pct": "cfp_kg",
     "energy_pct": "grid_kwh",
@@ -47,7 +47,7 @@ _AGAINST_IDLE = {
     "cost_pct": "cost",
     "peak_pct": "peak_kw",
 }
-"""Metric of each column of changes against idle commands."""
+"""Metric from which each column with a change relative to idle commands is computed."""
 TITLES = {
     "controller": "controller",
     "moves": "moves",
@@ -69,18 +69,20 @@ TITLES = {
     "points": "difference (points)",
     "probability": "improves (probability)",
 }
-"""Titles of columns in printed tables."""
+"""Title of each column in printed tables."""
 
 
 def summary(evaluation: Evaluation) -> pd.DataFrame:
-    """Results of all weeks together, a row for each controller.
+    """Return the results over all weeks, a row for each controller.
 
-    ``change_pct`` and the columns of single metrics are changes of the sum over all weeks against
-    idle commands, in %. ``interquartile_mean_pct`` is the mean of the middle half of all weeks'
-    changes, ``share_pct`` the share of the achievable. These three have the ends ``_low`` and
-    ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h, mean over the servers) and
-    ``overdue_task_h`` are means per week, ``dropped_pct`` is the share of arrived work that was
-    dropped, and ``broken_pct`` the share of weeks that break a constraint of the optimum.
+    ``change_pct`` is the change of the objective relative to idle commands, in %, after summing
+    over all weeks; ``carbon_pct``, ``energy_pct`` and so on are the same for single metrics.
+    ``interquartile_mean_pct`` is the interquartile mean of the changes of single weeks.
+    ``share_pct`` is the saving as a share of the achievable saving. These three have a 95 %
+    interval with ends ``_low`` and ``_high``; single metrics have none. ``over_27_degree_h`` (K h,
+    mean over the servers) and ``overdue_task_h`` are means per week. ``dropped_pct`` is the share
+    of arrived work that was dropped, and ``broken_pct`` is the share of weeks that violate a
+    constraint of the optimum.
     """
     import pandas as pd
 
@@ -94,26 +96,26 @@ def summary(evaluation: Evaluation) -> pd.DataFrame:
 
 
 def by_site(evaluation: Evaluation) -> pd.DataFrame:
-    """Change against idle commands in %, a row for each controller and a column for each site."""
+    """Return the change against idle commands, in %, a row per controller and column per site."""
     import pandas as pd
 
     sites = list(dict.fromkeys(evaluation.rows["site"])) if len(evaluation.rows) else []
     table = []
     for name, rows in _groups(evaluation, ALL):
-        of_sites = {site: rows[rows["site"] == site] for site in sites}
+        rows_by_site = {site: rows[rows["site"] == site] for site in sites}
         changes = {
-            site: float(change_pct(_sample(some, _column(evaluation)), _base(some)))
-            for site, some in of_sites.items()
+            site: float(change_pct(_sample(site_rows, _column(evaluation)), _base(site_rows)))
+            for site, site_rows in rows_by_site.items()
         }
         table.append({"controller": name} | changes)
     return pd.DataFrame(table)
 
 
 def by_agent(evaluation: Evaluation) -> pd.DataFrame:
-    """Results of each agent while the others are idle, a row for each agent and controller.
+    """Return results with one acting agent and idle others, a row per agent and controller.
 
-    Columns are those of ``summary``, and ``alone_pct`` is the change by the optimum of that agent
-    alone. The table is empty if no agent ran alone.
+    The table has the columns of ``summary`` and ``alone_pct``, the change in % that the optimum
+    achieves with this agent alone. The table is empty if no agent ran alone.
     """
     import pandas as pd
 
@@ -128,21 +130,22 @@ def by_agent(evaluation: Evaluation) -> pd.DataFrame:
 
 
 def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
-    """Comparison of a controller with each other one in the same weeks.
+    """Compare one controller with each other controller in the same weeks.
 
     Args:
         evaluation: the evaluation.
         controller: name of the controller.
 
     Returns:
-        A row for each other controller: ``points`` of the change against idle commands (below 0 is
-        better) with the ends of a 95 % interval, and the ``probability`` that a training of the
-        controller has the lower figure in a week, 0..1.
+        Table with a row for each other controller. ``points`` is the controller's change against
+        idle commands minus the other's, in percentage points (negative is better), with the ends of
+        a 95 % interval. ``probability`` is the probability, 0..1, that a training of the controller
+        has a lower objective in a week than the other controller.
     """
     import pandas as pd
 
     groups = dict(_groups(evaluation, ALL))
-    mine, base = _sample(groups[controller], _column(evaluation)), _base(groups[controller])
+    figures, base = _sample(groups[controller], _column(evaluation)), _base(groups[controller])
 
     def points(one: F64, idle: F64, other: F64, other_idle: F64) -> F64:
         return np.asarray(change_pct(one, idle) - change_pct(other, other_idle))
@@ -151,23 +154,23 @@ def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
     for name, rows in groups.items():
         if name == controller:
             continue
-        theirs = _sample(rows, _column(evaluation))
+        others = _sample(rows, _column(evaluation))
         row: dict[str, Any] = {"controller": controller, "than": name}
-        row |= _interval(evaluation, "points", points, mine, base, theirs, _base(rows))
-        table.append(row | {"probability": float(probability_of_improvement(mine, theirs))})
+        row |= _interval(evaluation, "points", points, figures, base, others, _base(rows))
+        table.append(row | {"probability": float(probability_of_improvement(figures, others))})
     return pd.DataFrame(table)
 
 
 def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F64]]:
-    """Compared figures of each controller, and those of idle commands.
+    """Return the objective values of each controller and of idle commands.
 
     Args:
         evaluation: the evaluation.
-        moves: commands that the controllers gave: ``all``, or one of load, cooling and battery.
+        moves: agents that acted: ``all``, or one of load, cooling and battery.
 
     Returns:
-        For each controller, its figures by training and week, (S, W), and those of idle commands,
-        (1, W), or (S, W) where they differ by seed.
+        For each controller, its objective values by training and week, (S, W), and those of idle
+        commands, (1, W), or (S, W) if they depend on the seed.
     """
     return {
         name: (_sample(rows, _column(evaluation)), _base(rows))
@@ -176,11 +179,13 @@ def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F6
 
 
 def column_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
-    """Values of a column for each controller that gave all its commands, (S, W) each.
+    """Return a column's values by training and week, (S, W), for each controller.
+
+    Only runs in which all agents of the controller acted are included.
 
     Args:
         evaluation: the evaluation.
-        column: column of its rows.
+        column: column of ``evaluation.rows``.
     """
     return {name: _sample(rows, column) for name, rows in _groups(evaluation, ALL)}
 
@@ -188,11 +193,11 @@ def column_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
 def text_rows(
     table: pd.DataFrame, titles: Mapping[str, str] = TITLES
 ) -> tuple[list[str], list[list[str]]]:
-    """Titles and cells of a table for display, with intervals in brackets and a dash for nan.
+    """Return titles and cells of a table as text, with intervals in brackets and a dash for nan.
 
     Args:
         table: one of the tables of this module.
-        titles: title of each column; a column without one has its name.
+        titles: title of each column; the default is the column's name.
     """
     shown = [str(name) for name in table.columns if not str(name).endswith(("_low", "_high"))]
     rows = []
@@ -210,11 +215,11 @@ def text_rows(
 
 
 def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
-    """A table as Markdown, with special characters of texts escaped.
+    """Return a table as Markdown, with special characters escaped.
 
     Args:
         table: one of the tables of this module.
-        titles: title of each column; a column without one has its name.
+        titles: title of each column; the default is the column's name.
     """
     heads, rows = text_rows(table, titles)
     lines = [" | ".join(map(literal_markdown, cells)) for cells in (heads, *rows)]
@@ -223,12 +228,12 @@ def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
 
 
 def literal_markdown(text: str) -> str:
-    """A text as one line of Markdown, with special characters escaped."""
+    """Return a text as one line of Markdown, with special characters escaped."""
     return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", printable(" ".join(text.split())))
 
 
 def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Rows of each controller that gave the commands ``moves``, in the order of the rows."""
+    """Yield name and rows of each controller, out of the runs with this value of ``moves``."""
     rows = evaluation.rows
     if len(rows):
         for name, group in rows[rows["moves"] == moves].groupby("controller", sort=False):
@@ -238,23 +243,24 @@ def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFr
 def _results(
     evaluation: Evaluation, rows: pd.DataFrame, best: F64 | None = None
 ) -> dict[str, float]:
-    """Results of one controller in ``summary``, by column.
+    """Return the results of one controller, by column of ``summary``.
 
     Args:
         evaluation: the evaluation.
         rows: rows of the controller.
-        best: figures that give a share of 1, (B,); None is those of the optimum of all agents.
+        best: objective values that count as a share of 100 %, (B,); None selects the achieved
+            path of the optimum of all agents.
     """
     base, figures = _base(rows), _sample(rows, _column(evaluation))
     achieved = _sample(rows, "achieved_figure")[:1] if best is None else best[None]
-    of_weeks = 100.0 * (figures / base - 1.0)
+    changes = 100.0 * (figures / base - 1.0)
     idle = dict(_groups(evaluation, ALL)).get(IDLE)
     arrived = rows["arrived_tasks"].sum(skipna=False)
-    # A bound has a figure and no metrics, and breaks no constraint.
+    # Rows without metrics are bounds of the optimum, which violate no constraint.
     checked = rows["broken"][rows["broken"].notna() & rows["cfp_kg"].notna()]
     return {
         **_interval(evaluation, "change_pct", change_pct, figures, base),
-        **_interval(evaluation, "interquartile_mean_pct", interquartile_mean, of_weeks),
+        **_interval(evaluation, "interquartile_mean_pct", interquartile_mean, changes),
         **_interval(evaluation, "share_pct", share_pct, figures, base, achieved),
         **{
             name: math.nan
@@ -272,7 +278,7 @@ def _results(
 def _interval(
     evaluation: Evaluation, name: str, statistic: Statistic, *samples: F64
 ) -> dict[str, float]:
-    """Columns of a statistic and its interval, with the same draws for every row."""
+    """Return table columns of a statistic and its interval; all rows use the same random draws."""
     generator = np.random.Generator(np.random.PCG64(_SEED))
     paired = len(_base(evaluation.rows)) > 1
     interval = bootstrap_interval(statistic, samples, evaluation.strata, generator, paired=paired)
@@ -280,25 +286,25 @@ def _interval(
 
 
 def _column(evaluation: Evaluation) -> str:
-    """Name of the column with the figures that are compared."""
+    """Return the name of the column with the objective values to compare."""
     has_optimum = bool(evaluation.rows["achieved_figure"].notna().any())
     return "valued_figure" if has_optimum else "figure"
 
 
 def _base(rows: pd.DataFrame) -> F64:
-    """Figures of idle commands in each week, (1, W), or (S, W) where they differ by seed."""
+    """Return the objective of idle commands, (1, W), or (S, W) if it depends on the seed."""
     base = _sample(rows, "idle_figure")
     return base[:1] if np.array_equal(base, np.broadcast_to(base[:1], base.shape)) else base
 
 
 def _sample(rows: pd.DataFrame, column: str) -> F64:
-    """Values of a column by training and week, (S, W); rows are in the order of the weeks."""
+    """Return a column's values by training and week, (S, W); weeks stay in row order."""
     width = len(set(zip(rows["site"], rows["week"], strict=True)))
     return rows[column].to_numpy(np.float64).reshape(-1, width)
 
 
 def _cell(value: Any, decimals: int = 2) -> str:
-    """A value of a table as text."""
+    """Return a table value as text; numbers that are not finite become a dash."""
     if isinstance(value, str):
         return value
     if isinstance(value, int | np.integer):
@@ -307,14 +313,14 @@ def _cell(value: Any, decimals: int = 2) -> str:
 
 
 def is_compared(name: str) -> bool:
-    """Whether a controller is neither idle nor the optimum, the two ends of the scale."""
+    """Return True unless the name stands for idle commands or the optimum (the references)."""
     return name not in (IDLE, OPTIMUM)
 
 
 FORMAT = "sdc-evaluation/1"
-"""Version of the format of evaluation.json."""
+"""Format version in ``evaluation.json``."""
 EVALUATION_FILE, ROWS_FILE, TABLE_FILE = "evaluation.json", "rows.csv", "table.md"
-"""Files of an evaluation."""
+"""Names of the files of an evaluation."""
 
 
 def evaluation_content(
@@ -324,13 +330,13 @@ def evaluation_content(
     command: str = "",
     folders: Sequence[Path] = (),
 ) -> dict[str, Any]:
-    """Content of evaluation.json.
+    """Return the content of ``evaluation.json``.
 
     Args:
         evaluation: the evaluation.
         weeks: the weeks of the evaluation.
-        command: command line that repeats the evaluation.
-        folders: folders of its trainings or policies.
+        command: command line that reproduces the evaluation.
+        folders: folders of the evaluated trainings or policies.
     """
     names = [n for n in dict.fromkeys(evaluation.rows.get("controller", ())) if is_compared(n)]
     return {
@@ -358,7 +364,7 @@ def evaluation_content(
 
 
 def remarks(weeks: DataCenterWeeks) -> list[str]:
-    """Warnings about weeks in which energy and work left at the end have no value.
+    """Return warnings about weeks in which energy and work left at the end have no value.
 
     Args:
         weeks: the weeks of the evaluation.
@@ -374,7 +380,7 @@ def remarks(weeks: DataCenterWeeks) -> list[str]:
 
 
 def tables_of(evaluation: Evaluation, weeks: DataCenterWeeks) -> list[tuple[str, pd.DataFrame]]:
-    """Tables with their titles: all weeks together, by site, by agent, and differences.
+    """Return titles and tables: all weeks together, by site, by agent, and differences.
 
     Args:
         evaluation: the evaluation.
@@ -399,7 +405,7 @@ def prepare_evaluation_folder(out: Path, *, force: bool = False) -> None:
 
     Args:
         out: the folder.
-        force: whether to accept a folder with other files.
+        force: True to accept a folder that contains other files.
 
     Raises:
         SdcError: ``out`` is a file, holds other files, or cannot be created.
@@ -421,13 +427,13 @@ def prepare_evaluation_folder(out: Path, *, force: bool = False) -> None:
 def write_evaluation(
     out: Path, evaluation: Evaluation, weeks: DataCenterWeeks, content: Mapping[str, Any]
 ) -> None:
-    """Write rows.csv, table.md and, last, evaluation.json.
+    """Write ``rows.csv``, ``table.md`` and, last, ``evaluation.json``.
 
     Args:
         out: the folder.
         evaluation: the evaluation.
         weeks: the weeks of the evaluation.
-        content: content of evaluation.json.
+        content: content of ``evaluation.json``.
 
     Raises:
         SdcError: a file cannot be written.
@@ -448,10 +454,10 @@ def write_evaluation(
 
 
 def content_json(content: Mapping[str, Any]) -> str:
-    """JSON text of the content of evaluation.json."""
+    """Return the content of ``evaluation.json`` as text."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 def _records(table: pd.DataFrame) -> Any:
-    """Rows of a table for JSON, with None for nan."""
+    """Return the rows of a table as dicts for JSON, with None in place of nan."""
     return table.astype(object).where(table.notna(), None).to_dict("records")

@@ -22,51 +22,53 @@ from sdc_taichi.sim.fleet import Fleet
 
 
 class ObservedFeature(Section):
-    """A feature of an observation, or several of one kind side by side."""
+    """A feature of an observation, with one entry or several consecutive entries."""
 
     name: str
     """Name of the feature, as in docs/observations.md."""
     unit: str
     """Unit of the value before scaling."""
     low: float
-    """Lower end of the range that is scaled, in ``unit``."""
+    """Lower end of the value range before scaling, in ``unit``."""
     high: float
-    """Upper end of the range that is scaled, in ``unit``."""
+    """Upper end of the value range before scaling, in ``unit``."""
     size: int = Field(ge=1)
-    """Number of entries side by side."""
+    """Number of consecutive entries of the observation."""
 
 
 class Interface(Section):
-    """Observations and actions of an environment, as far as a policy depends on them."""
+    """The properties of an environment's observations and actions on which a policy depends."""
 
     agents: tuple[Agent, ...]
-    """Agents that act, in the order of their actions."""
+    """Agents with a policy, in the order of their actions."""
     actions: Literal["discrete", "continuous"]
-    """Whether an agent chooses one of three commands or a number."""
+    """Type of actions: one of three discrete commands, or a continuous number."""
     action_order: Literal["paper", "sustaindc"] | None
-    """Order of the battery's discrete actions; None where there are none."""
+    """Order of the battery's discrete actions; None if the battery has no discrete actions."""
     commands: dict[str, tuple[str, ...]]
-    """Commands that each agent decides, in the order of its action."""
+    """Commands that each agent decides, in the order of the entries of its action."""
     setpoint_change_k: float | None
-    """Change of the setpoint in one step by a continuous action of 1, in K; None where there is no
-    such action."""
+    """Setpoint change per step for a continuous action of 1, in K; None without such an action."""
     fan_change: float | None
-    """Change of the CRAC fan speed over full speed in one step by a continuous action of 1; None
-    where there is no such action."""
+    """Change of the CRAC fan speed per step for a continuous action of 1, as a share of full speed;
+    None without such an action."""
     observations: Literal["default", "sustaindc"]
-    """Whether agents observe named features or the vectors of the released code."""
+    """Type of observations: ``default`` for named features, ``sustaindc`` for the observation
+    vectors of the SustainDC release."""
     features: dict[str, tuple[ObservedFeature, ...]]
     """Features that each agent observes, in the order of its observation."""
     ci_leads_h: tuple[float, ...]
-    """Leads of the carbon-intensity forecast, in h; empty for vectors of the released code."""
+    """Lead times of the carbon-intensity forecast, in h; empty for observations ``sustaindc``."""
     weather_leads_h: tuple[float, ...]
-    """Leads of the weather forecasts, in h; empty for vectors of the released code."""
+    """Lead times of the weather forecasts, in h; empty for observations ``sustaindc``."""
     step_min: int = Field(ge=1, le=60)
     """Length of a step, in min."""
     crac_units: int | None = Field(ge=1)
-    """Number of CRAC units of a data center that an agent decides on; None where none does."""
+    """Number of CRAC units that an agent controls in a data center; None if no agent controls CRAC
+    units."""
     racks: int | None = Field(ge=1)
-    """Number of racks of a data center that an agent places work on; None where none does."""
+    """Number of racks on which an agent places work in a data center; None if no agent places
+    work."""
 
     @model_validator(mode="after")
     def _of_all_agents(self) -> Interface:
@@ -76,16 +78,16 @@ class Interface(Section):
         return self
 
     def width(self, agent: str) -> int:
-        """Number of entries of an agent's observation, n."""
+        """Return the number n of entries of an agent's observation."""
         return sum(feature.size for feature in self.features[agent])
 
     def action_width(self, agent: str) -> int:
-        """Number of numbers that an agent decides in a step, k."""
+        """Return the number k of entries of an agent's action."""
         numbers = {"cooling": self.crac_units, "fan": self.crac_units, "placement": self.racks}
         return sum(numbers.get(name) or 1 for name in self.commands[agent])
 
     def options(self, **others: Any) -> EnvOptions:
-        """Options of environments that have this interface.
+        """Return options of environments that have this interface.
 
         Args:
             others: further options of the environments, by name.
@@ -109,7 +111,7 @@ class Interface(Section):
         return make_options(**{k: v for k, v in options.items() if v is not None}, **others)
 
     def difference(self, other: Interface) -> str | None:
-        """First difference between this interface and another, as text; None if they are equal."""
+        """Describe the first difference from another interface; None if they are equal."""
         for name, label in _LABELS.items():
             ours, others = getattr(self, name), getattr(other, name)
             if ours != others:
@@ -156,18 +158,18 @@ _LABELS = {
     "crac_units": "CRAC units (hvac.crac.units)",
     "racks": "racks",
 }
-"""Names of the fields of ``Interface`` in messages, in the order in which they are compared."""
+"""Name of each field of ``Interface`` in messages, in the order of comparison."""
 
 
 def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
-    """The interface between environments and the policies of the agents that learn in them.
+    """Return the interface of environments to the policies of their learning agents.
 
     Args:
         fleet: the data centers.
         options: options of the environments.
 
     Raises:
-        ConfigError: options do not fit the data centers, or observations contain heat maps.
+        ConfigError: the options do not fit the data centers, or observations contain heat maps.
     """
     if options.heat_map:
         raise ConfigError("heat_map True: policies observe features alone; valid is False")
@@ -176,7 +178,7 @@ def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
     decided: dict[str, tuple[str, ...]] = {
         agent: options.commands_of(agent) for agent in options.agents
     }
-    names = {name for of_agent in decided.values() for name in of_agent}
+    names = {name for commands in decided.values() for name in commands}
     continuous, named = options.actions == "continuous", options.observations == "default"
     has_order = not continuous and "battery" in names
     on_units = bool(names & {"cooling", "fan"})
@@ -208,7 +210,7 @@ def _observed(features: Sequence[Feature]) -> tuple[ObservedFeature, ...]:
 def _feature_difference(
     ours: Sequence[ObservedFeature], others: Sequence[ObservedFeature]
 ) -> str | None:
-    """First difference between the features of an agent, as text; None if they are equal."""
+    """Describe the first difference between the features of an agent; None if they are equal."""
     for feature, other in zip_longest(ours, others):
         if feature != other:
             return f"{_feature_text(feature)} in training, {_feature_text(other)} here"
@@ -216,7 +218,7 @@ def _feature_difference(
 
 
 def _feature_text(feature: ObservedFeature | None) -> str:
-    """Name, entries and range of a feature."""
+    """Return name, number of entries and range of a feature as text."""
     if feature is None:
         return "no feature"
     values = f"{feature.low:g}..{feature.high:g} {feature.unit}"
@@ -224,7 +226,7 @@ def _feature_text(feature: ObservedFeature | None) -> str:
 
 
 def _text(value: Any) -> str:
-    """Short text of a value of an interface."""
+    """Return a field value of an interface as short text."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_text(entry)}" for name, entry in value.items())
     if isinstance(value, tuple):

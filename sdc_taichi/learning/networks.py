@@ -1,8 +1,12 @@
 """Networks of policies and critics, distributions of actions, moments of inputs, random numbers.
 
-Off-policy critics value the actions of all learners together. K numbers are decided in a step. If
-each is one of L choices, there are L^K joint actions, and a critic has one output for each:
-expected values over independent choices are then exact sums.
+Off-policy critics estimate the value of joint actions, which consist of the K actions of all
+learners in a step. If each of the K actions is one of L levels, there are L^K joint actions, and a
+critic has one output for each of them. Expected values over independent choices are then exact
+sums.
+
+In shapes, B and N are numbers of rows of a batch, n is the number of inputs, and E the number of
+critics.
 """
 
 from __future__ import annotations
@@ -21,29 +25,29 @@ from sdc_taichi.learning.stream import LearnerSpaces
 from sdc_taichi.types import F32
 
 USES = ("weights", "actions", "batches", "order")
-"""Uses of random numbers: first weights of networks, actions drawn from policies, steps to learn
-from, and the order in which learners are updated."""
+"""Uses of random numbers: initial weights of networks, actions drawn from policies, choice of the
+steps in a batch, and the order in which learners are updated."""
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:
-    """Generators by use, so that drawing more for one use changes no other.
+    """Return a random generator for each use, so that the numbers of one use affect no other.
 
     Args:
-        seed: seed of the training, from which each generator gets a seed that no other has.
+        seed: seed of the training, from which each generator gets a different seed.
     """
     return {use: torch.Generator().manual_seed(seed * len(USES) + i) for i, use in enumerate(USES)}
 
 
 LEAST_STD = 1e-2
-"""Smallest standard deviation to divide by, so that almost constant entries stay small."""
+"""Lower bound of the standard deviation for normalisation; nearly constant inputs stay small."""
 CLIP = 10.0
-"""Largest absolute normalised value."""
+"""Maximum absolute value of a normalised input."""
 LAST_GAIN = 0.01
-"""Gain of the last weights of policies and of critics of actions, whose outputs begin near 0."""
+"""Gain of the last layer's initial weights; small, so that the initial outputs are near 0."""
 
 
 class RunningMoments:
-    """Mean and variance of all rows seen, by column (Chan, Golub, LeVeque 1983).
+    """Running mean and variance of each column of the added rows (Chan, Golub, LeVeque 1983).
 
     Args:
         width: number of columns.
@@ -51,7 +55,7 @@ class RunningMoments:
     Attributes:
         mean: mean of each column, (width,).
         variance: variance of each column, (width,).
-        count: number of rows seen.
+        count: number of added rows.
     """
 
     def __init__(self, width: int) -> None:
@@ -61,14 +65,14 @@ class RunningMoments:
 
     @property
     def std(self) -> Tensor:
-        """Standard deviation to divide by, (width,), f32."""
+        """Standard deviation of each column, at least ``LEAST_STD``, (width,), f32."""
         return self.variance.sqrt().clamp_min(LEAST_STD).float()
 
     def add(self, rows: Tensor) -> None:
-        """Take rows, (n, width), into account."""
+        """Update the moments with rows, (n, width)."""
         n = len(rows)
         row_mean = rows.mean(0)
-        # Many times faster than Tensor.var, which goes through rows one by one.
+        # This is many times faster than Tensor.var, which iterates over single rows.
         variance = (rows - row_mean).square_().mean(0).double()
         mean = row_mean.double()
         total = self.count + n
@@ -83,15 +87,15 @@ class RunningMoments:
         self.count = total
 
     def normalise(self, values: Tensor) -> Tensor:
-        """Values less the mean over the standard deviation, within -CLIP..CLIP."""
+        """Subtract the mean, divide by the standard deviation, and clip to -CLIP..CLIP."""
         return ((values - self.mean.float()) / self.std).clamp_(-CLIP, CLIP)
 
     def state_dict(self) -> dict[str, object]:
-        """Everything that ``load_state_dict`` needs."""
+        """Return the moments, for ``load_state_dict``."""
         return {"mean": self.mean, "variance": self.variance, "count": self.count}
 
     def load_state_dict(self, values: dict[str, object]) -> None:
-        """Restore the state that ``state_dict`` returned."""
+        """Restore the moments that ``state_dict`` returned."""
         self.mean, self.variance = _tensor(values["mean"]), _tensor(values["variance"])
         self.count = int(str(values["count"]))
 
@@ -101,9 +105,9 @@ def _tensor(value: object) -> Tensor:
 
 
 class _TanhBySigmoid(torch.autograd.Function):
-    """The hyperbolic tangent by the logistic function, tanh(x) = 2 s(2 x) - 1.
+    """Hyperbolic tangent computed from the logistic function s, tanh(x) = 2 s(2 x) - 1.
 
-    PyTorch's logistic function takes a sixth of the time of its tanh on processors with AVX-512.
+    On processors with AVX-512, PyTorch's logistic function is six times as fast as its tanh.
     """
 
     @staticmethod
@@ -119,10 +123,10 @@ class _TanhBySigmoid(torch.autograd.Function):
 
 
 class Tanh(nn.Module):
-    """Hyperbolic tangent, to within rounding."""
+    """Layer with the hyperbolic tangent, equal to ``torch.tanh`` except for rounding."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Tangents of x, of its shape."""
+        """Return the hyperbolic tangent of each element of x."""
         return _TanhBySigmoid.apply(x)
 
 
@@ -140,15 +144,15 @@ def perceptron(
     last_gain: float,
     generator: torch.Generator,
 ) -> nn.Sequential:
-    """Layers with orthogonal weights (Saxe et al. 2014) and biases of 0.
+    """Return a perceptron with orthogonal initial weights (Saxe et al. 2014) and biases of 0.
 
     Args:
         width: number of inputs.
-        hidden: units of each hidden layer.
+        hidden: number of units in each hidden layer.
         out: number of outputs.
-        activation: ``tanh`` or ``relu``, after all layers but the last.
+        activation: activation function of all layers except the last, ``tanh`` or ``relu``.
         last_gain: gain of the weights of the last layer.
-        generator: source of the weights.
+        generator: random generator of the initial weights.
     """
     layers: list[nn.Module] = []
     for units in hidden:
@@ -165,7 +169,7 @@ def _linear(width: int, out: int, gain: float, generator: torch.Generator) -> nn
 
 
 def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
-    """Copies of the weight, (out, in), and bias, (out,), of each layer."""
+    """Return copies of each layer's weight, (out, in), and bias, (out,)."""
     return tuple(
         (layer.weight.detach().float().numpy().copy(), layer.bias.detach().float().numpy().copy())
         for layer in net
@@ -181,15 +185,16 @@ def policy_network(
     activation: Activation = "tanh",
     head: Head = "clip",
 ) -> PolicyNetwork:
-    """The network of the policy of a learner.
+    """Return a learner's policy as a network that runs without PyTorch.
 
     Args:
         layers: weight, (out, in), and bias, (out,), of each layer.
         mean: mean of the observations, (n,).
         std: standard deviation of the observations, (n,).
         spaces: sizes of the observations and actions of the learner.
-        activation: function of all layers but the last.
-        head: how continuous actions follow from the outputs; choices are those of highest score.
+        activation: activation function of all layers except the last.
+        head: function that maps outputs to continuous actions; for discrete choices, the option
+            with the highest score is taken instead.
     """
     return PolicyNetwork(
         agents=spaces.agents,
@@ -204,15 +209,15 @@ def policy_network(
 
 
 class Actor(nn.Module):
-    """Policy of a learner: a distribution of its actions for each observation.
+    """Stochastic policy of a learner: a distribution of its k actions for each observation.
 
-    Actions are k independent choices, or, where any number is possible, k independent normal
-    distributions whose standard deviations do not depend on the observation.
+    The k actions are independent. Discrete actions have categorical distributions. Continuous
+    actions have normal distributions whose standard deviations do not depend on the observation.
 
     Args:
         spaces: sizes of the observations and actions of the learner.
-        settings: hidden layers and activation.
-        generator: source of the weights.
+        settings: settings of the algorithm, with hidden layers and activation function.
+        generator: random generator of the initial weights.
     """
 
     def __init__(
@@ -237,11 +242,11 @@ class Actor(nn.Module):
 
         Args:
             observations: normalised observations, (B, n).
-            generator: source of the draws.
+            generator: random generator of the actions.
 
         Returns:
-            Actions, (B, k), and logarithms of their probabilities, (B,). Continuous ones may lie
-            beyond -1..1.
+            Actions, (B, k), and the logarithm of their joint probability, (B,). Continuous actions
+            can be outside -1..1.
         """
         out = self.net(observations)
         if self.choices is not None:
@@ -255,7 +260,7 @@ class Actor(nn.Module):
         return actions, self._log_density(noise)
 
     def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithms of the probabilities of actions, (B,), and the mean entropy.
+        """Return the log-probability of actions, (B,), and the mean entropy of the policy, ().
 
         Args:
             observations: normalised observations, (B, n).
@@ -269,35 +274,35 @@ class Actor(nn.Module):
         return self._log_density((actions - out) / self.log_std.exp()), entropy
 
     def _log_probabilities(self, out: Tensor) -> Tensor:
-        """Logarithms of the probabilities of each choice, (B, k, choices)."""
-        # Over a few columns, log_softmax takes ten times as long as over as few long rows.
+        """Return the log-probability of each option of each action, (B, k, choices)."""
+        # log_softmax along a short last axis takes ten times as long as along a short first axis.
         by_choice = out.unflatten(-1, (-1, self.choices)).movedim(-1, 0).contiguous()
         return by_choice.log_softmax(0).movedim(0, -1)
 
     def _log_density(self, noise: Tensor) -> Tensor:
-        """Logarithm of the density at a distance from the mean in standard deviations, (B,)."""
+        """Return the log-density of actions, (B,), from standardised deviations from the mean."""
         each = -0.5 * noise * noise - self.log_std - 0.5 * math.log(2.0 * math.pi)
         return each.sum(-1)
 
 
 def _of_chosen(log_p: Tensor, actions: Tensor) -> Tensor:
-    """Logarithm of the probability of the choices made, (B,)."""
+    """Return the joint log-probability of the chosen options, (B,)."""
     return log_p.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)
 
 
 MOST_JOINT_ACTIONS = 729
-"""Largest number of joint actions that a critic values: those of six choices out of three."""
+"""Maximum number of joint actions, and so of critic outputs: 3^6, six actions of three options."""
 
 
 class Perceptrons:
-    """E perceptrons of equal shape, evaluated together.
+    """Ensemble of E perceptrons of equal shape, evaluated together.
 
     Args:
         number: number of perceptrons, E.
-        width: number of inputs of each.
-        out: number of outputs of each.
-        settings: hidden layers and their activation.
-        generator: source of the weights, which are orthogonal (Saxe et al. 2014).
+        width: number of inputs of each perceptron.
+        out: number of outputs of each perceptron.
+        settings: settings of the algorithm, with hidden layers and activation function.
+        generator: random generator of the orthogonal initial weights (Saxe et al. 2014).
 
     Attributes:
         parameters: weights, (E, in, out), and biases, (E, 1, out), layer by layer.
@@ -324,11 +329,12 @@ class Perceptrons:
             parameter.requires_grad_()
 
     def __call__(self, inputs: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
-        """Outputs, (E, N, out).
+        """Return the outputs of all perceptrons, (E, N, out).
 
         Args:
-            inputs: (N, width).
-            parameters: weights and biases to use instead, such as those of a target network.
+            inputs: inputs, the same for all perceptrons, (N, width).
+            parameters: parameters to use in place of the attribute, such as those of a target
+                network.
         """
         used = self.parameters if parameters is None else parameters
         x = inputs.expand(len(used[0]), *inputs.shape)
@@ -340,20 +346,21 @@ class Perceptrons:
 
 
 class JointValues:
-    """Values of all joint actions of K choices in a state, by E critics.
+    """E critics that estimate the value of every joint action of K discrete choices in a state.
 
-    The output is dueling (Wang et al. 2016), Q = V + A - mean A. The advantage of a joint action is
-    the sum of one term for each choice and one for their combination: A(a) = A_1(a_1) + ... +
-    A_K(a_K) + A_all(a). Any table has this form, and the effect of a choice that does not depend on
-    the other choices is learned from every step in which it was made.
+    The critics are dueling networks (Wang et al. 2016), Q = V + A - mean A. The advantage of a
+    joint action is the sum of one term for each choice and one for their combination: A(a) =
+    A_1(a_1) + ... + A_K(a_K) + A_all(a). Any table of values can be written in this form. If the
+    effect of a choice does not depend on the other choices, it is learned from every step with
+    that choice.
 
     Args:
         number: number of critics, E.
         width: number of entries of a state.
         choices: number of choices in a step, K.
-        settings: hidden layers and their activation.
-        generator: source of the weights.
-        levels: number of possibilities of each choice, L.
+        settings: settings of the algorithm, with hidden layers and activation function.
+        generator: random generator of the initial weights.
+        levels: number of options of each choice, L.
 
     Attributes:
         parameters: weights and biases of the critics.
@@ -381,18 +388,19 @@ class JointValues:
         self._places = levels ** torch.arange(choices - 1, -1, -1)
         digits = torch.arange(joint_actions)[:, None] // self._places % levels
         one_hot = torch.nn.functional.one_hot(digits, levels).flatten(1)
-        # Outputs are V, then A_1 ... A_K, one for each level, then A_all.
+        # The outputs are V, then A_1 ... A_K with L levels each, then A_all.
         self._of_choices = one_hot.T.float()
         out = 1 + levels * choices + joint_actions
         self._nets = Perceptrons(number, width, out, settings, generator)
         self.parameters = self._nets.parameters
 
     def __call__(self, state: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
-        """Values of all joint actions in each state, (E, N, L^K); the last choice varies fastest.
+        """Return the values of all joint actions, (E, N, L^K); the last choice varies fastest.
 
         Args:
-            state: (N, width).
-            parameters: weights and biases to use instead, such as those of a target network.
+            state: states, (N, width).
+            parameters: parameters to use in place of the attribute, such as those of a target
+                network.
         """
         out = self._nets(state, parameters)
         of_choices = len(self._of_choices)
@@ -403,12 +411,13 @@ class JointValues:
     def of_actions(
         self, state: Tensor, actions: Tensor, parameters: Sequence[Tensor] | None = None
     ) -> Tensor:
-        """Values of joint actions, (E, N).
+        """Return the values of joint actions, (E, N).
 
         Args:
-            state: (N, width).
-            actions: choices, (N, K).
-            parameters: weights and biases to use instead, such as those of a target network.
+            state: states, (N, width).
+            actions: chosen options, (N, K).
+            parameters: parameters to use in place of the attribute, such as those of a target
+                network.
         """
         table = self(state, parameters)
         joint = (actions.long() * self._places).sum(-1)
@@ -416,14 +425,14 @@ class JointValues:
 
 
 class ContinuousValues:
-    """Values of joint actions of K numbers within -1..1 in a state, by E critics.
+    """E critics that estimate the value of K continuous actions, each within -1..1, in a state.
 
     Args:
         number: number of critics, E.
         width: number of entries of a state.
         numbers: number of actions in a step, K.
-        settings: hidden layers and their activation.
-        generator: source of the weights.
+        settings: settings of the algorithm, with hidden layers and activation function.
+        generator: random generator of the initial weights.
 
     Attributes:
         parameters: weights and biases of the critics.
@@ -443,26 +452,27 @@ class ContinuousValues:
     def of_actions(
         self, state: Tensor, actions: Tensor, parameters: Sequence[Tensor] | None = None
     ) -> Tensor:
-        """Values of joint actions, (E, N).
+        """Return the values of joint actions, (E, N).
 
         Args:
-            state: (N, width).
-            actions: numbers, (N, K).
-            parameters: weights and biases to use instead, such as those of a target network.
+            state: states, (N, width).
+            actions: actions within -1..1, (N, K).
+            parameters: parameters to use in place of the attribute, such as those of a target
+                network.
         """
         return self._nets(torch.cat([state, actions], dim=-1), parameters).squeeze(-1)
 
 
 def expected(table: Tensor, probabilities: Tensor, free: Collection[int] = ()) -> Tensor:
-    """Expected values of joint actions under independent choices.
+    """Return the expected values of joint actions under independent random choices.
 
     Args:
         table: values of all joint actions, (N, L^K).
-        probabilities: probabilities of each choice, (N, K, L).
-        free: numbers of the F choices for which no expectation is taken.
+        probabilities: probability of each option of each choice, (N, K, L).
+        free: indices of the F choices for which no expectation is taken.
 
     Returns:
-        Values of all combinations of the free choices, (N, L^F).
+        Expected value of each combination of the free choices, (N, L^F).
     """
     right, levels = 1, probabilities.shape[-1]
     for choice in reversed(range(probabilities.shape[1])):

@@ -1,24 +1,25 @@
-"""HAD3QN and HASAC: one update, of which each algorithm is a special case.
+"""The off-policy algorithms HAD3QN and HASAC, as special cases of one update.
 
-All agents act for some steps, which are added to a replay of earlier steps. Then batches of
-transitions over n decisions are drawn from it. E critics Q_e of the shared state and the actions of
-all learners are fitted to
+All agents act for some steps, which are added to a replay buffer. Then batches of n-step
+transitions are drawn from the buffer. E critics Q_e, which take the shared state and the actions of
+all learners, are fitted by Adam to the targets
 
     y = r_0 + ... + gamma^(n-1) r_(n-1) + gamma^n V(s_n),
 
-by Adam, where r is the reward of the team and V comes from slow copies of the critics. Episodes are
-cut off, never terminated, so V counts at their end too. The algorithms differ in V and in how the
-learners, one after another in random order, learn from the critics:
+where r is the reward of the team and V comes from target critics (slowly updated copies). Episodes
+are truncated, never terminated, so V is also added at the end of an episode. The learners are
+updated one after another in random order. The algorithms differ in V and in that update:
 
-- ``had3qn`` (Zhong et al. 2024) has one dueling critic (Wang et al. 2016). V is the value of the
-  choices that are best by the learners' own values (double, van Hasselt et al. 2016), which are
-  fitted to the critic's. Choices are random with a probability that falls during the training.
-- ``hasac`` (Liu et al. 2024) has two critics, of which the lower value counts. V is soft: the
-  expected value under the policies, plus their entropies weighted by temperatures. Learners
-  maximise it.
+- ``had3qn`` (Zhong et al. 2024) has one dueling critic (Wang et al. 2016). Each learner has its own
+  action values, which are fitted to the critic's. The learners' values select the best actions, and
+  V is the target critic's value of these actions (double Q-learning, van Hasselt et al. 2016).
+  Exploration is epsilon-greedy with a decreasing epsilon.
+- ``hasac`` (Liu et al. 2024) has two critics and uses the minimum of their values. V is the soft
+  value: the expected value under the policies plus the policies' entropies, weighted by
+  temperatures. The learners maximise the soft value.
 
-The source of HASAC has a further temperature for the critic. Here the critic's V has those of the
-learners, so that critic and learners have the same objective.
+The published HASAC has an additional temperature for the critic. Here V uses the temperatures of
+the learners, so that critic and learners have the same objective.
 """
 
 from __future__ import annotations
@@ -52,23 +53,24 @@ from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
 STATE = "state"
-"""Name of the shared state's columns."""
+"""Name of the columns that hold the shared state."""
 LEAST_SCALE = 1e-6
-"""Least standard deviation of returns to divide by."""
+"""Lower bound of the standard deviation of returns by which targets are divided."""
 
 
 class OffPolicy:
-    """A learner for each policy, updated from transitions drawn from a replay.
+    """Off-policy algorithm: learners that are updated from transitions in a replay buffer.
 
     Args:
-        definition: properties in which the algorithm differs from others.
+        definition: properties in which the off-policy algorithms differ.
         settings: settings of the algorithm.
         stream: the environments to learn in.
-        updates: number of updates of the whole training, over which exploration falls.
+        updates: total number of updates of the training; sets the schedules of exploration and
+            learning rate.
         seed: seed of weights, actions, order of learners and drawn transitions.
 
     Raises:
-        ConfigError: the algorithm cannot decide such actions.
+        ConfigError: the algorithm does not support the environments' actions.
     """
 
     def __init__(
@@ -99,20 +101,20 @@ class OffPolicy:
 
     @property
     def exploration(self) -> float:
-        """Probability of a random choice in the update under way."""
+        """Probability of a random choice (epsilon) in the current update."""
         s = self._settings
         done = self._done / max(1.0, s.exploration_share * self._updates)
         return max(s.exploration, 1.0 - (1.0 - s.exploration) * done)
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Act for ``rollout_decisions`` decisions, and learn from the replay.
+        """Act for ``rollout_decisions`` decisions, and learn from the replay buffer.
 
         Args:
             stream: the environments.
 
         Returns:
-            Numbers to log: ``reward/NAME``, the mean over steps; means of losses, entropies and
-            temperatures over gradient steps; ``exploration`` of algorithms that have it.
+            Values to log: ``reward/NAME``, the mean reward per step; losses, entropies and
+            temperatures, averaged over the gradient steps; ``exploration`` for ``had3qn``.
         """
         if self._replay is None:
             self._replay = self._new_replay(stream.size)
@@ -127,21 +129,21 @@ class OffPolicy:
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """The current policies, which take the best choice or the mean."""
+        """Return the current policies without randomness (highest score, or mean action)."""
         columns = dict(self._columns)
         mean, std = self._moments.mean.float().numpy(), self._moments.std.numpy()
         networks = []
-        for name, of in self._spaces.items():
+        for name, sizes in self._spaces.items():
             *inner, (weight, bias) = layers_of(self._actors.nets[name])
-            outputs = of.action_width * (of.choices or 1)
+            outputs = sizes.action_width * (sizes.choices or 1)
             layers = (*inner, (weight[:outputs], bias[:outputs]))
-            of_learner = mean[columns[name]], std[columns[name]]
+            moments = mean[columns[name]], std[columns[name]]
             activation = self._settings.activation
-            networks.append(policy_network(layers, *of_learner, of, activation, "tanh"))
+            networks.append(policy_network(layers, *moments, sizes, activation, "tanh"))
         return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state, including the replay."""
+        """Return the complete state of the training, including the replay buffer."""
         return {
             "done": self._done,
             "generators": {n: g.get_state() for n, g in self._generators.items()},
@@ -155,7 +157,7 @@ class OffPolicy:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
+        """Restore a state from ``state_dict`` of an algorithm with the same arguments."""
         self._done = int(values["done"])
         for name, generator in self._generators.items():
             generator.set_state(values["generators"][name])
@@ -189,13 +191,13 @@ class OffPolicy:
     # Acting
 
     def _collect(self, stream: EnvironmentStream, replay: Replay) -> dict[str, float]:
-        """Act with the current policies, and return the mean reward of each learner."""
+        """Act with the current policies, and return the values to log, such as mean rewards."""
         rewards = {name: torch.zeros(()) for name in self._spaces}
-        seen = []
+        situations = []
         with torch.no_grad():
             for _ in range(self._settings.rollout_decisions):
                 before = torch.cat([stream.state, *(stream.observations[n] for n in rewards)], 1)
-                seen.append(before)
+                situations.append(before)
                 actions = self._actors.act(
                     self._situation(before), self.exploration, self._generators["actions"]
                 )
@@ -209,13 +211,13 @@ class OffPolicy:
                     replay.end(torch.cat([after.next_state, *ends], 1))
                 for name in rewards:
                     rewards[name] += after.rewards[name].mean()
-            self._moments.add(torch.cat(seen))
+            self._moments.add(torch.cat(situations))
         steps = self._settings.rollout_decisions * self._settings.decision_steps
         logged = {f"reward/{n}": float(x) / steps for n, x in rewards.items()}
         return logged if self._soft else logged | {"exploration": self.exploration}
 
     def _measure(self, reward: Tensor) -> None:
-        """Add the reward of a step, (B,), to the moments of rewards and of returns."""
+        """Update the running moments of rewards and returns with the reward of a step, (B,)."""
         self._rewards.add(reward.unsqueeze(-1))
         if not len(self._running_return):
             self._running_return = torch.zeros_like(reward)
@@ -224,7 +226,7 @@ class OffPolicy:
         self._returns.add(self._running_return.unsqueeze(-1))
 
     def _situation(self, columns: Tensor) -> Situation:
-        """Normalised shared state and observations, from their columns side by side, (N, m + n)."""
+        """Normalise concatenated shared states and observations, (N, m + n), and split them."""
         normal = self._moments.normalise(columns)
         state, *others = ((name, normal[:, part]) for name, part in self._columns)
         return Situation(state[1], dict(others))
@@ -232,14 +234,17 @@ class OffPolicy:
     # Learning
 
     def _anneal(self) -> None:
-        """Lower the learning rate, in even steps to 0 over the training."""
+        """Lower the learning rate linearly, from its initial value to 0 during the training."""
         if self._settings.anneal:
             rate = self._settings.rate * max(0.0, 1.0 - self._done / self._updates)
             for optimiser in (self._adam, *self._actors.adams.values()):
                 optimiser.param_groups[0]["lr"] = rate
 
     def _learn(self, replay: Replay) -> dict[str, Tensor]:
-        """Update the critics, then each learner, then the slow copies of the critics."""
+        """Take a gradient step of the critics and of each learner, and update the target critics.
+
+        Return the losses, entropies and temperatures to log.
+        """
         s = self._settings
         drawn = replay.sample(s.batch_size, self._generators["batches"])
         before, after = self._situation(drawn.before), self._situation(drawn.after)
@@ -254,11 +259,11 @@ class OffPolicy:
         return {"critic_loss": loss.detach(), **logged}
 
     def _critic_targets(self, drawn: Transitions, after: Situation) -> Tensor:
-        """Targets y of the critics, (N,).
+        """Return the targets y of the critics, (N,).
 
-        The mean reward is subtracted, which changes no policy as episodes never terminate, and the
-        result is divided by the standard deviation of discounted returns, so that values are of
-        order one for any reward.
+        The mean reward is subtracted from every reward; this changes no optimal policy because
+        episodes never terminate. The returns are then divided by the standard deviation of
+        discounted returns, so that values are of order one for any reward.
         """
         discount = self._settings.discount
         later = discount**drawn.steps
@@ -270,18 +275,18 @@ class OffPolicy:
 
 
 def critic_loss(values: Tensor, targets: Tensor) -> Tensor:
-    """Half the mean squared error, summed over the critics.
+    """Return half the mean squared error of the values, summed over the critics.
 
     Args:
-        values: values by critic, (E, N).
-        targets: values to learn, (N,).
+        values: values of each of the E critics for N transitions, (E, N).
+        targets: target of each transition, (N,).
     """
     return 0.5 * (values - targets).square().mean(-1).sum()
 
 
 def _columns(spaces: Mapping[str, LearnerSpaces], state_width: int) -> list[tuple[str, slice]]:
-    """Columns of the shared state and of each learner's observation, side by side."""
-    widths = [(STATE, state_width), *((n, of.observation_width) for n, of in spaces.items())]
+    """Return the columns of shared state and each learner's observation when concatenated."""
+    widths = [(STATE, state_width), *((n, x.observation_width) for n, x in spaces.items())]
     ends = list(accumulate(width for _, width in widths))
     return [(n, slice(end - width, end)) for (n, width), end in zip(widths, ends, strict=True)]
 
@@ -293,8 +298,8 @@ def _critic_and_actors(
     state_width: int,
     generator: torch.Generator,
 ) -> tuple[JointValues | ContinuousValues, GreedyActors | SoftActors | GaussianActors]:
-    """Critics, and the policies that follow them."""
-    numbers = sum(of.action_width for of in spaces.values())
+    """Return the critics, and the policies that learn from them."""
+    numbers = sum(sizes.action_width for sizes in spaces.values())
     shape = definition.critics, state_width, numbers, settings, generator
     levels = next(iter(spaces.values())).choices
     if levels is not None:
@@ -310,41 +315,42 @@ def _critic_and_actors(
 
 
 class Transitions(NamedTuple):
-    """N transitions over one step or several."""
+    """Batch of N multi-step transitions; each spans one or more steps."""
 
     before: Tensor
-    """Situations before the first step, (N, width)."""
+    """Shared states and observations before the first step, (N, width)."""
     actions: Tensor
     """Actions of the first step, (N, actions)."""
     returns: Tensor
-    """Discounted sum of the rewards of the steps, (N,)."""
+    """Discounted sum of the rewards of a transition's steps, (N,)."""
     steps: Tensor
-    """Number of steps, at least 1, (N,)."""
+    """Number of steps of each transition, at least 1, (N,)."""
     after: Tensor
-    """Situations after the last step, (N, width)."""
+    """Shared states and observations after the last step, (N, width)."""
 
 
 class Replay:
-    """Latest steps of B environments, whose episodes are cut off together.
+    """Replay buffer with the latest steps of B environments, whose episodes end together.
 
-    A row is the situation of all environments at one time: shared state and observations. The
-    situation at the end of an episode has a row without actions, so that the row after a step is
-    always the situation that followed it.
+    A situation is the shared state and the observations of one environment at one time. A row of
+    the buffer holds the situations of all environments before a step, with the actions and rewards
+    of the step. The end of an episode has a further row without actions. The row after a step
+    therefore always holds the situations that followed the step.
 
     Args:
-        size: largest number of situations of all environments together.
+        size: capacity in situations, summed over all environments.
         num_envs: number of environments, B.
         width: number of entries of a situation.
         actions: number of actions in each step.
-        steps: largest number of steps of a transition, n.
-        discount: weight of a reward one step later.
+        steps: maximum number n of steps of a transition.
+        discount: discount factor per step.
 
     Attributes:
-        rows: largest number of rows.
+        rows: capacity in rows.
         num_envs: number of environments, B.
 
     Raises:
-        ConfigError: the replay is too small for a transition of n steps.
+        ConfigError: the buffer is too small for a transition of n steps.
     """
 
     def __init__(
@@ -358,7 +364,7 @@ class Replay:
                 f"valid is at least {least * num_envs}"
             )
         self._width, self._steps, self._discount = width, steps, discount
-        # Situation, actions and reward are adjacent, so that a draw reads memory in one place.
+        # Situation, actions and reward are adjacent in memory, so that a draw makes one access.
         self._data = torch.empty(self.rows, num_envs, width + actions + 1)
         self._is_end = torch.zeros(self.rows, dtype=torch.bool)
         self._count = 0
@@ -371,12 +377,12 @@ class Replay:
         return min(self._count, self.rows)
 
     def add(self, situations: Tensor, actions: Tensor, rewards: Tensor) -> None:
-        """Append a step of all environments.
+        """Append one step of all environments.
 
         Args:
             situations: situations before the step, (B, width).
-            actions: (B, actions).
-            rewards: (B,).
+            actions: actions of the step, (B, actions).
+            rewards: rewards of the step, (B,).
         """
         row = self._next_row(is_end=False)
         row[:, : self._width] = situations
@@ -384,22 +390,22 @@ class Replay:
         row[:, -1] = rewards
 
     def end(self, situations: Tensor) -> None:
-        """Append the situations, (B, width), in which all episodes were cut off."""
+        """Append the situations at the end of the episodes, (B, width)."""
         row = self._next_row(is_end=True)
         row[:, : self._width] = situations
         row[:, self._width :] = 0.0
 
     def sample(self, number: int, generator: torch.Generator) -> Transitions:
-        """Draw transitions with equal probability.
+        """Draw transitions uniformly at random.
 
-        A transition is shorter than n steps if its episode or the replay ends before.
+        A transition is shorter than n steps if the episode or the recorded data end earlier.
 
         Args:
             number: number of transitions, N.
-            generator: source of the draws.
+            generator: random generator of the draws.
 
         Raises:
-            SdcError: the replay has fewer than two rows.
+            SdcError: the buffer does not contain a transition yet.
         """
         if self._starts is None:
             self._starts = self._find_starts()
@@ -423,7 +429,7 @@ class Replay:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that ``load_state_dict`` needs."""
+        """Return the content of the buffer, for ``load_state_dict``."""
         return {
             "data": self._data[: self.filled],
             "is_end": self._is_end[: self.filled],
@@ -431,10 +437,10 @@ class Replay:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` of a replay with equal arguments returned.
+        """Restore the content that ``state_dict`` of a buffer with the same arguments returned.
 
         Raises:
-            SdcError: the state is of a replay of another shape.
+            SdcError: the saved content has a different shape.
         """
         data = torch.as_tensor(values["data"])
         filled = min(int(values["count"]), self.rows)
@@ -447,7 +453,7 @@ class Replay:
         self._starts = None
 
     def _next_row(self, *, is_end: bool) -> Tensor:
-        """The row to write to, (B, columns)."""
+        """Return a view of the next row to write, (B, columns); the oldest row is overwritten."""
         at = self._count % self.rows
         self._is_end[at] = is_end
         self._count += 1
@@ -455,7 +461,7 @@ class Replay:
         return self._data[at]
 
     def _find_starts(self) -> Tensor:
-        """Rows from which a transition can start; sets the number of its steps for each row."""
+        """Return the rows in which transitions can start; set the transition length of each row."""
         in_time = torch.arange(self._count - self.filled, self._count)
         stops = self._is_end[in_time % self.rows].clone()
         stops[-1] = True

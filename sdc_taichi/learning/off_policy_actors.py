@@ -1,8 +1,11 @@
 """Policies of HAD3QN and HASAC, which learn from a critic of joint actions.
 
-Learners are updated one after another in random order (Zhong et al. 2024). Each is updated for the
-new policies of the learners before it and the old policies of those after it, so that no two of
-them react to the same gain.
+Learners are updated one after another in random order (Zhong et al. 2024). The update of a learner
+uses the new policies of the learners already updated and the old policies of the others, so that no
+two learners respond to the same possible improvement.
+
+In shapes, N is the batch size, K the number of actions of all learners together, k the number of
+one learner's actions, and L the number of levels of a discrete action.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
 """Bounds of the logarithm of the standard deviation of actions before the hyperbolic tangent."""
 
 Values = TypeVar("Values", bound=JointValues | ContinuousValues)
-"""Type of the critic: of choices, or of continuous numbers."""
+"""Type of the critic: for discrete choices, or for continuous actions."""
 
 
 class Situation(NamedTuple):
@@ -41,21 +44,21 @@ class Situation(NamedTuple):
 
 
 class Actors(Generic[Values]):
-    """Networks of all learners, which decide K numbers side by side.
+    """Policy networks of all learners, which decide K actions together.
 
-    A network has an output for each choice of a number. For a continuous number it has one output
-    for the mean and one for the logarithm of the standard deviation.
+    For a discrete action, a network has one output per level. For a continuous action, it has one
+    output for the mean and one for the logarithm of the standard deviation.
 
     Args:
         critic: critic that the policies learn from.
         spaces: sizes of the observations and actions of each learner.
         settings: settings of the algorithm.
-        generator: source of the weights.
+        generator: random generator of the initial weights.
 
     Attributes:
         nets: network of each learner.
         adams: optimiser of each learner's network.
-        numbers: columns of each learner's numbers.
+        numbers: columns of each learner in an array of all actions, (N, K).
     """
 
     def __init__(
@@ -98,11 +101,11 @@ class Actors(Generic[Values]):
             self.adams[name].load_state_dict(values[name]["adam"])
 
     def _choice_outputs(self, situation: Situation) -> Tensor:
-        """Outputs for each choice of each number, (N, K, L)."""
+        """Return the network output for each level of each action, (N, K, L)."""
         return torch.cat(
             [
-                self.nets[name](seen).unflatten(-1, (-1, self._outputs))
-                for name, seen in situation.observations.items()
+                self.nets[name](inputs).unflatten(-1, (-1, self._outputs))
+                for name, inputs in situation.observations.items()
             ],
             dim=1,
         )
@@ -114,26 +117,27 @@ class Actors(Generic[Values]):
         )
 
     def _order(self, generator: torch.Generator) -> list[str]:
-        """Learners in random order."""
+        """Return the names of the learners in random order."""
         names = list(self.nets)
         return [names[i] for i in torch.randperm(len(names), generator=generator).tolist()]
 
 
 class GreedyActors(Actors[JointValues]):
-    """Values of each learner's choices, of which it takes the best: HAD3QN (Zhong et al. 2024).
+    """Learners of HAD3QN, which choose the action with the highest value (Zhong et al. 2024).
 
-    A learner's values are fitted to the row of the critic's table for the choices of the others:
-    the updated choices of the learners before it in a random order, the current ones of those
-    after it. The source fits the value of the best choice alone; the row has those of all choices.
+    The critic has a table of values with an entry for each joint action. The values of a learner
+    are fitted to the row of that table in which the other learners' actions are fixed: new actions
+    of the learners already updated, old actions of the others. The publication fits only the value
+    of the best action; here the values of all actions of the row are fitted.
     """
 
     def act(self, situation: Situation, exploration: float, generator: torch.Generator) -> Tensor:
-        """Best choices, (N, K), some of them replaced by random ones.
+        """Return epsilon-greedy choices, (N, K).
 
         Args:
-            situation: what the learners observe.
-            exploration: probability of a random choice, epsilon.
-            generator: source of the draws.
+            situation: normalised shared state and observations.
+            exploration: probability epsilon of a random choice.
+            generator: random generator of the exploration.
         """
         best = self._choice_outputs(situation).argmax(-1)
         explores = torch.rand(best.shape, generator=generator) < exploration
@@ -144,12 +148,16 @@ class GreedyActors(Actors[JointValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
     ) -> Tensor:
-        """Values of the best choices by the target critic, (N,) (van Hasselt et al. 2016)."""
+        """Return the target critic's values of the learners' best choices, (N,).
+
+        Selection by the learners and evaluation by the critic is double Q-learning (van Hasselt et
+        al. 2016).
+        """
         best = self._choice_outputs(after).argmax(-1)
         return self._critic.of_actions(after.state, best, targets).amin(0)
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
-        """Fit individual values to the critic's table, and return the loss of each learner."""
+        """Fit each learner's action values to the critic's table; return the losses by learner."""
         outputs = self._choice_outputs(situation)
         with torch.no_grad():
             table = self._critic(situation.state).amin(0)
@@ -169,16 +177,16 @@ class GreedyActors(Actors[JointValues]):
 
 
 class EntropicActors(Actors[Values]):
-    """Stochastic policies with a reward for their entropy.
+    """Stochastic policies with an entropy bonus.
 
-    Each learner has a temperature, which is adjusted until its entropy equals a target (Haarnoja et
-    al. 2018).
+    The weight of the entropy is the temperature. Each learner has a temperature, which is adjusted
+    until the entropy of the learner's policy equals a target (Haarnoja et al. 2018).
 
     Args:
         critic: critic that the policies learn from.
         spaces: sizes of the observations and actions of each learner.
         settings: settings of the algorithm.
-        generator: source of the weights.
+        generator: random generator of the initial weights.
     """
 
     def __init__(
@@ -189,12 +197,12 @@ class EntropicActors(Actors[Values]):
         generator: torch.Generator,
     ) -> None:
         super().__init__(critic, spaces, settings, generator)
-        self._wanted_entropies: dict[str, float] = {}
-        for name, of in spaces.items():
-            of_number = settings.continuous_entropy
-            if of.choices is not None:
-                of_number = settings.entropy_share * math.log(of.choices)
-            self._wanted_entropies[name] = of_number * of.action_width
+        self._target_entropies: dict[str, float] = {}
+        for name, sizes in spaces.items():
+            per_action = settings.continuous_entropy
+            if sizes.choices is not None:
+                per_action = settings.entropy_share * math.log(sizes.choices)
+            self._target_entropies[name] = per_action * sizes.action_width
         start = math.log(settings.temperature)
         self._log_temperatures = {name: torch.tensor(start, requires_grad=True) for name in spaces}
         self._temperature_adams = {
@@ -203,7 +211,7 @@ class EntropicActors(Actors[Values]):
         }
 
     def temperature(self, name: str) -> Tensor:
-        """Temperature of a learner, ()."""
+        """Return the temperature of a learner, shape ()."""
         return self._log_temperatures[name].detach().exp()
 
     def state_dict(self) -> dict[str, Any]:
@@ -224,10 +232,10 @@ class EntropicActors(Actors[Values]):
             self._temperature_adams[name].load_state_dict(of["adam"])
 
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
-        """Update the network and the temperature of a learner, and return numbers to log."""
+        """Update the network and the temperature of a learner, and return values to log."""
         self._descend(loss, name)
         log = self._log_temperatures[name]
-        excess = log * (entropy - self._wanted_entropies[name])
+        excess = log * (entropy - self._target_entropies[name])
         descend(excess, [log], self._temperature_adams[name], math.inf)
         return {
             f"policy_loss/{name}": loss.detach(),
@@ -237,14 +245,14 @@ class EntropicActors(Actors[Values]):
 
 
 class SoftActors(EntropicActors[JointValues]):
-    """Random choices of each learner, with a reward for entropy: HASAC (Liu et al. 2024).
+    """Learners of HASAC with discrete choices: stochastic policies with an entropy bonus.
 
-    The critic has an output for each joint action, so that all expected values are exact, as in
-    Christodoulou (2019) for one agent.
+    HASAC is by Liu et al. (2024). The critic has an output for each joint action, so that all
+    expected values are exact, as in the single-agent algorithm of Christodoulou (2019).
     """
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
-        """Choices drawn from the policies, (N, K)."""
+        """Draw choices from the policies, (N, K)."""
         scores = self._choice_outputs(situation)
         noise = torch.empty_like(scores).exponential_(generator=generator).log_()
         return (scores - noise).argmax(-1)
@@ -252,7 +260,10 @@ class SoftActors(EntropicActors[JointValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
     ) -> Tensor:
-        """Soft values of the target critic, (N,): expected value plus temperature x entropy."""
+        """Return soft values of the target critic, (N,).
+
+        A soft value is the expected value plus the entropies times the temperatures.
+        """
         log_p = self._choice_outputs(after).log_softmax(-1)
         value = expected(self._critic(after.state, targets).amin(0), log_p.exp()).squeeze(-1)
         return value + sum(
@@ -278,26 +289,26 @@ class SoftActors(EntropicActors[JointValues]):
         return logged
 
     def _log_p(self, name: str, situation: Situation) -> Tensor:
-        """Logarithms of a learner's probabilities of each choice, (N, k, L)."""
+        """Return the log-probability of each level of a learner's choices, (N, k, L)."""
         scores = self.nets[name](situation.observations[name])
         return scores.unflatten(-1, (-1, self._outputs)).log_softmax(-1)
 
 
 class GaussianActors(EntropicActors[ContinuousValues]):
-    """Continuous actions of each learner, with a reward for entropy: HASAC (Liu et al. 2024).
+    """Learners of HASAC with continuous actions: stochastic policies with an entropy bonus.
 
-    An action is the hyperbolic tangent of a normal number (Haarnoja et al. 2018), and gradients of
-    the critic reach the policy through the action.
+    HASAC is by Liu et al. (2024). An action is the hyperbolic tangent of a normally distributed
+    number (Haarnoja et al. 2018). The critic is differentiated with respect to the action.
     """
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
-        """Actions drawn from the policies, (N, K)."""
+        """Draw actions from the policies, (N, K)."""
         return self._draw_all(situation, generator)[0]
 
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, generator: torch.Generator
     ) -> Tensor:
-        """Soft values of drawn actions by the target critic, (N,)."""
+        """Return the target critic's soft values of actions drawn from the policies, (N,)."""
         actions, log_p = self._draw_all(after, generator)
         value = self._critic.of_actions(after.state, actions, targets).amin(0)
         return value - sum(self.temperature(name) * log_p[name] for name in self.nets)
@@ -321,7 +332,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     def _draw_all(
         self, situation: Situation, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actions of all learners, (N, K), and logarithms of the density of each, (N,)."""
+        """Draw the actions of all learners, (N, K); return them and each learner's log-density."""
         drawn = {name: self._draw(name, situation, generator) for name in self.nets}
         joint = torch.cat([actions for actions, _ in drawn.values()], dim=1)
         return joint, {name: log_p for name, (_, log_p) in drawn.items()}
@@ -329,7 +340,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     def _draw(
         self, name: str, situation: Situation, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Actions of a learner, (N, k), and logarithms of their densities, (N,)."""
+        """Draw the actions of a learner, (N, k); return them and their log-densities, (N,)."""
         mean, log_std = self.nets[name](situation.observations[name]).chunk(2, dim=-1)
         log_std = log_std.clamp(LEAST_LOG_STD, MOST_LOG_STD)
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
@@ -337,20 +348,20 @@ class GaussianActors(EntropicActors[ContinuousValues]):
 
 
 def adam(parameters: Any, rate: float) -> torch.optim.Adam:
-    """Adam (Kingma, Ba 2015), fused: one pass over all parameters."""
+    """Return a fused Adam optimiser (Kingma and Ba 2015), which updates all parameters at once."""
     return torch.optim.Adam(parameters, rate, fused=True)
 
 
 def descend(
     loss: Tensor, parameters: Sequence[Tensor], optimiser: torch.optim.Adam, norm: float
 ) -> None:
-    """Take a gradient step of some parameters, without gradients of others.
+    """Take a gradient step of the given parameters; no other gradient is computed.
 
     Args:
-        loss: the loss, ().
-        parameters: parameters of the optimiser.
+        loss: the loss, shape ().
+        parameters: parameters to update, which are those of ``optimiser``.
         optimiser: the optimiser.
-        norm: largest norm of the gradient.
+        norm: maximum norm of the gradient; ``inf`` for no maximum.
     """
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
         parameter.grad = gradient
@@ -360,16 +371,18 @@ def descend(
 
 
 def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: int) -> Tensor:
-    """Values of each number's choices for fixed choices of the others, one number after another.
+    """Return the values of each action's levels while the other actions are fixed.
+
+    The actions are processed one after another. Each is set to its best level before the next.
 
     Args:
         table: values of all joint actions, (N, L^K).
-        choices: choices at the beginning, (N, K).
-        order: numbers in the order in which each changes to its best choice.
-        levels: number of possibilities of each choice, L.
+        choices: initial level of each action, (N, K).
+        order: indices of the actions, in the order of processing.
+        levels: number of levels of each action, L.
 
     Returns:
-        Values, (N, K, L).
+        Value of each level of each action, (N, K, L).
     """
     taken = nn.functional.one_hot(choices, levels).to(table.dtype)
     rows = torch.empty_like(taken)
@@ -381,31 +394,32 @@ def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: i
 
 
 def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tensor:
-    """Negative of the soft value of k independent choices (Christodoulou 2019, eq. 12).
+    """Return the negative mean soft value of k independent choices (Christodoulou 2019, eq. 12).
 
     Args:
-        log_p: logarithms of the probabilities of each choice, (N, k, L).
+        log_p: log-probability of each level of each choice, (N, k, L).
         values: values of all combinations of the choices, (N, L^k).
-        temperature: weight of the entropy, ().
+        temperature: weight of the entropy, shape ().
     """
     value = expected(values, log_p.exp()).squeeze(-1)
     return -(value + temperature * entropies(log_p)).mean()
 
 
 def entropies(log_p: Tensor) -> Tensor:
-    """Entropies of independent choices, (N,), nats.
+    """Return the joint entropy of k independent choices, in nats, (N,).
 
     Args:
-        log_p: logarithms of the probabilities of each choice, (N, k, L).
+        log_p: log-probability of each level of each choice, (N, k, L).
     """
     return -(log_p.exp() * log_p).sum((-1, -2))
 
 
 def squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Hyperbolic tangents of normal numbers, and logarithms of their densities.
+    """Return hyperbolic tangents of normally distributed numbers, and their log-densities.
 
-    With u = mean + std noise, the density of tanh(u) is that of u over 1 - tanh(u)^2 (Haarnoja et
-    al. 2018, appendix C), whose logarithm is 2 (log 2 - u - softplus(-2 u)).
+    With u = mean + std * noise, the density of tanh(u) is the density of u divided by
+    1 - tanh(u)^2 (Haarnoja et al. 2018, appendix C). The logarithm of 1 - tanh(u)^2 is
+    2 (log 2 - u - softplus(-2 u)).
 
     Args:
         mean: means, (N, k).
@@ -413,7 +427,7 @@ def squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tens
         noise: standard normal numbers, (N, k).
 
     Returns:
-        Actions, (N, k), and logarithms of their densities, (N,).
+        Actions, (N, k), and log-densities of the k actions together, (N,).
     """
     u = mean + log_std.exp() * noise
     normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)

@@ -1,7 +1,10 @@
-"""Transitions from a batch of environments as tensors, for each learner.
+"""Stream of transitions from a batch of environments, as tensors for each learner.
 
 A learner has one policy; it acts for one agent, or for all learning agents together. A new episode
-begins as soon as one is cut off, and the step that cuts it off also holds its last observations.
+begins as soon as the last one ends, and the final step also returns the final observations.
+
+In shapes, B is the number of environments, n the number of entries of a learner's observation, k
+the number of its actions, and m the number of entries of the shared state.
 """
 
 from __future__ import annotations
@@ -32,63 +35,65 @@ class LearnerSpaces:
     """Sizes of the observation and the action of a learner in one environment."""
 
     agents: tuple[str, ...]
-    """Agents that it acts for, in the order of its actions."""
+    """Agents that the learner acts for, in the order of its actions."""
     observation_width: int
-    """Number of entries of its observation, n."""
+    """Number n of entries of the learner's observation."""
     action_width: int
-    """Number of numbers that it decides, k."""
+    """Number k of actions that the learner decides."""
     choices: int | None
-    """Number of choices for each number: 3 for discrete actions, the number of levels for
-    continuous actions with levels; None for any number within -1..1."""
+    """Number of options of each action: 3 for discrete actions, the number of levels for
+    continuous actions with levels; None if an action can be any number within -1..1."""
 
 
 class StreamStep(NamedTuple):
-    """Rewards, ends of episodes and next observations of a step of all environments."""
+    """Rewards and next observations of one decision of all environments."""
 
     rewards: dict[str, Tensor]
     """Reward of each learner, (B,) each."""
     team: Tensor
     """Mean reward of the learning agents, (B,)."""
     ended: bool
-    """Whether the episodes were cut off after the step; those of a batch end together."""
+    """True if all episodes of the batch ended (were truncated) after the step."""
     next_observations: dict[str, Tensor]
-    """Observations after the step by learner, (B, n) each; those of the old episode if the step
-    cut it off."""
+    """Observations after the step by learner, (B, n) each. After the last step of an episode, they
+    are the final observations of that episode."""
     next_state: Tensor
-    """Shared state after the step, (B, m); that of the old episode if the step cut it off."""
+    """Shared state after the step, (B, m). After the last step of an episode, it is the final
+    state of that episode."""
 
 
 class _Rewards(NamedTuple):
-    """Rewards of a step of all environments."""
+    """Rewards of one step of all environments, (B,) each, by learner and for the team."""
 
     by_learner: Mapping[str, F64]
     team: F64
 
 
 class EnvironmentStream:
-    """Environments that begin a new episode as soon as the last one is cut off.
+    """Batch of environments that begin a new episode as soon as the last one ends.
 
     Args:
         env: batch of environments made by ``sdc_taichi.vector_env``.
-        joint: whether one learner acts for all learning agents.
-        decision_steps: steps between two decisions; actions are held in between.
-        levels: number of levels, evenly from -1 to 1, from which learners choose continuous
-            actions; None is any number.
-        shares_state: whether to compute the shared state, which takes time.
-        against_idle: whether to subtract the rewards of idle commands in the same step, if all
-            episodes of a data center have the same inputs.
+        joint: True if one learner acts for all learning agents.
+        decision_steps: number of steps from one decision to the next; actions are repeated in
+            between.
+        levels: number of equally spaced levels from -1 to 1 from which learners choose continuous
+            actions; None allows any number.
+        shares_state: True to compute the shared state, which takes time.
+        against_idle: True to subtract the reward of idle commands in the same step. It has an
+            effect only if all episodes of a data center have the same inputs.
         seed: seed of the first reset; environment i has ``seed + i``.
 
     Attributes:
         learners: names of the learners.
         spaces: sizes of the observations and actions of each learner.
-        state_width: number of entries of the shared state, m; 0 without it.
+        state_width: number m of entries of the shared state; 0 without a shared state.
         size: number of environments, B.
-        decision_steps: steps between two decisions.
+        decision_steps: number of steps from one decision to the next.
         observations: observations before the next step by learner, (B, n) each.
         state: shared state before the next step, (B, m).
-        returns: mean over all environments of the sum of rewards in the last complete episode, by
-            learner; empty before an episode has ended.
+        returns: undiscounted return of the last complete episode, averaged over the environments,
+            by learner; empty before an episode has ended.
 
     Raises:
         ConfigError: observations contain heat maps, which perceptrons cannot read.
@@ -142,10 +147,10 @@ class EnvironmentStream:
         """Advance all environments to the next decision, or to the end of their episodes.
 
         Args:
-            actions: actions of each learner, (B, k): numbers of choices, or numbers within -1..1.
+            actions: actions of each learner, (B, k): indices of options, or numbers within -1..1.
 
         Returns:
-            Observations after the last step, and the sums of the rewards of the steps.
+            Observations after the last step, and rewards summed over the steps.
         """
         core, by_agent = self._core, self._by_agent(actions)
         transition = core.step(by_agent)
@@ -173,7 +178,7 @@ class EnvironmentStream:
         return self._core.steps
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the environments, for ``load_state_dict`` of a stream with equal arguments."""
+        """Return the state, for ``load_state_dict`` of a stream with the same arguments."""
         sums = {"returns": dict(self.returns), "sums": dict(self._sums)}
         return {"environments": self._core.state_dict(), **sums}
 
@@ -181,13 +186,13 @@ class EnvironmentStream:
         """Restore the state that ``state_dict`` returned.
 
         Raises:
-            SdcError: the state is of other environments.
+            SdcError: the state belongs to different environments.
         """
         self._take(self._core.load_state_dict(values["environments"]))
         self.returns, self._sums = dict(values["returns"]), dict(values["sums"])
 
     def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Actions by agent as arrays, (B,) if an agent makes one choice, else (B, k)."""
+        """Return actions by agent as arrays; (B,) for a single discrete action, else (B, k)."""
         levels = self._levels
         arrays = {
             name: (values if levels is None else levels[values]).numpy()
@@ -201,7 +206,7 @@ class EnvironmentStream:
         }
 
     def _rewards(self, transition: Transition) -> _Rewards:
-        """Rewards of a step, less those of idle commands in the same step if they are recorded."""
+        """Return the rewards of a step, minus those of idle commands if these are recorded."""
         rewards = self._full_rewards(transition)
         if not self._idle:
             return rewards
@@ -217,20 +222,20 @@ class EnvironmentStream:
         return _Rewards(by_learner, joint / len(self._core.agents))
 
     def _rewards_of_idle(self, seed: int) -> list[_Rewards]:
-        """Rewards of each step of an episode of idle commands.
+        """Run an episode with idle commands, and return the rewards of each step.
 
-        They do not depend on the actions of learners, so subtracting them changes no optimal policy
-        (Weaver and Tao 2001). It removes the effects of demand, weather and grid, which exceed
-        those of any action.
+        These rewards do not depend on the actions of learners, so subtracting them changes no
+        optimal policy (Weaver and Tao 2001). The subtraction removes the effects of demand, weather
+        and grid on the reward, which are larger than the effect of any action.
         """
         core = self._core
         core.reset(seed)
         return [self._full_rewards(core.step(core.idle_actions())) for _ in range(core.steps)]
 
     def _take(self, by_agent: Mapping[str, Observation]) -> None:
-        """Set observations and shared state before the next step."""
-        seen = by_agent if self._joint is None else {JOINT: self._joint.observation(by_agent)}
-        self.observations = {name: _tensor(seen[name]) for name in self.learners}
+        """Set the observations and the shared state before the next step."""
+        arrays = by_agent if self._joint is None else {JOINT: self._joint.observation(by_agent)}
+        self.observations = {name: _tensor(arrays[name]) for name in self.learners}
         if self._shares_state:
             self.state = _tensor(self._core.state())
         else:
@@ -238,5 +243,5 @@ class EnvironmentStream:
 
 
 def _tensor(array: Any) -> Tensor:
-    """A float32 copy as a tensor."""
+    """Return a float32 copy of an array as a tensor."""
     return torch.from_numpy(np.array(array, dtype=np.float32))

@@ -1,12 +1,12 @@
-"""The folder of a training: its lock, settings, curves and checkpoint.
+"""The folder of a training: its lock, settings, learning curves and checkpoint.
 
-Settings are in ``settings.yaml``, curves in ``training.csv``, ``validation.csv`` and
-``tensorboard``. The last policy is in ``policy``, the policy with the best result in the validation
-weeks in ``best``, and everything that a resumed training needs in ``checkpoint.safetensors``.
+``settings.yaml`` holds the settings. ``training.csv``, ``validation.csv`` and ``tensorboard`` hold
+the learning curves. ``policy`` holds the last policy, and ``best`` the policy with the best result
+in the validation weeks. ``checkpoint.safetensors`` holds everything that is needed to resume.
 
-The state in a checkpoint consists of dicts, lists, tuples, texts, numbers, None, NumPy arrays and
-torch tensors. The file has the format safetensors, with arrays and tensors as its entries, and the
-nesting and all other values as JSON in its metadata.
+The state in a checkpoint consists of dicts, lists, tuples, strings, numbers, None, NumPy arrays and
+torch tensors. Arrays and tensors are entries of the safetensors file. The nesting and all other
+values are JSON in the file's metadata.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from sdc_taichi.learning.training_settings import TrainingSettings, load_setting
 from sdc_taichi.user_file import decoding, list_folder, open_input
 
 SETTINGS_FILE, CHECKPOINT_FILE = "settings.yaml", "checkpoint.safetensors"
-"""Files of a training."""
+"""File names of settings and checkpoint in a training folder."""
 TRAINING_FILE, VALIDATION_FILE = "training.csv", "validation.csv"
-"""Curves of a training."""
+"""File names of the learning curves in a training folder."""
 LAST_POLICY, BEST_POLICY, EVENTS = "policy", "best", "tensorboard"
-"""Folders of a training."""
+"""Subfolders of a training folder: last policy, best policy, TensorBoard events."""
 
 
 @contextlib.contextmanager
@@ -46,11 +46,12 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
     Args:
         out: the folder; created if it does not exist and ``resume`` is false.
         settings: settings of the training.
-        resume: whether the folder must hold a training with these settings.
+        resume: True if the folder must contain a training with these settings; False if it must be
+            empty.
 
     Raises:
-        SdcError: the folder holds other files, a training to resume is missing or has other
-            settings, another process trains there, or nothing can be written there.
+        SdcError: the folder contains other files, the training to resume is missing or has
+            different settings, another process trains there, or the folder is not writable.
     """
     with naming_errors(out):
         if out.exists() and not out.is_dir():
@@ -80,7 +81,7 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
 
 
 def write_settings(folder: Path, settings: TrainingSettings) -> None:
-    """Write the settings of a training, which mark its folder as that of a training.
+    """Write the settings file, which marks a folder as a training folder.
 
     Raises:
         SdcError: the file cannot be written.
@@ -90,10 +91,10 @@ def write_settings(folder: Path, settings: TrainingSettings) -> None:
 
 
 def settings_of(folder: Path) -> TrainingSettings:
-    """Settings of the training in a folder.
+    """Read the settings of the training in a folder.
 
     Raises:
-        ConfigError: the folder holds no training, or the settings are not valid.
+        ConfigError: the folder contains no training, or the settings are not valid.
     """
     if not (folder / SETTINGS_FILE).is_file():
         raise ConfigError(f"{folder}: holds no training; valid is a folder that train has written")
@@ -101,15 +102,15 @@ def settings_of(folder: Path) -> TrainingSettings:
 
 
 UPDATE = "update"
-"""First column of both curves: number of the update after which a row was written."""
+"""Name of the first column of both learning curves: number of updates done so far."""
 
 
 class CsvLog:
-    """A CSV file to which rows are appended; a row with a new column adds it to the table.
+    """CSV file to which rows are appended; a new name in a row adds a column to the table.
 
     Args:
         path: the file; it may have rows of an interrupted training.
-        until: last update whose rows stay; rows of later updates are deleted.
+        until: number of the last valid update; rows of later updates are deleted.
 
     Raises:
         SdcError: the file cannot be read or written.
@@ -140,12 +141,12 @@ class CsvLog:
             file.write(self._text([row]))
 
     def _read(self) -> list[dict[str, str]]:
-        """Complete rows of the file; also sets the columns."""
+        """Return the complete rows of the file, and set the columns."""
         if not self._path.exists():
             return []
         with naming_errors(self._path):
             text = self._path.read_text(encoding="utf-8", errors="replace")
-        # The last row is incomplete if the process was killed while it wrote the row.
+        # The last row may be incomplete: the process may have been killed during writing.
         reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
         rows = [row for row in reader if None not in (*row, *row.values())]
         self._columns = list(reader.fieldnames or ())
@@ -162,11 +163,11 @@ class CsvLog:
 
 
 class EventLog:
-    """TensorBoard events of a training.
+    """Writer of a training's TensorBoard events.
 
     Args:
         folder: folder of the events; None writes no events.
-        after: step after which events of an interrupted training are invalid.
+        after: last valid step; events of an interrupted training after it are discarded.
 
     Raises:
         SdcError: TensorBoard is not installed, or the folder cannot be written.
@@ -188,11 +189,11 @@ class EventLog:
         self._folder = folder
 
     def add(self, numbers: Mapping[str, float], step: int) -> None:
-        """Write numbers by name.
+        """Write scalar values.
 
         Args:
-            numbers: the numbers.
-            step: number of steps of all data centers together.
+            numbers: value of each scalar by name.
+            step: number of steps done, summed over all data centers.
 
         Raises:
             SdcError: the events cannot be written.
@@ -227,22 +228,22 @@ class EventLog:
 
 
 FORMAT = "sdc-taichi state"
-"""Name of the format, in the metadata of a file."""
+"""Format name in the metadata of a checkpoint file."""
 VERSION = "1"
-"""Version of how states are written as JSON."""
+"""Version of the JSON encoding of states."""
 Array = npt.NDArray[Any]
 
 
 def write_state(path: Path, state: Any) -> None:
-    """Write a state, replacing the file as a whole.
+    """Write a state to a file; an existing file is replaced atomically.
 
     Args:
         path: the file; its folder is created if it does not exist.
-        state: the state, which ``read_state`` returns.
+        state: the state, which ``read_state`` can read back.
 
     Raises:
         SdcError: the file cannot be written.
-        TypeError: a value has another type than those above.
+        TypeError: the type of a value is not supported.
     """
     from safetensors.numpy import save
 
@@ -256,7 +257,7 @@ def write_state(path: Path, state: Any) -> None:
 
 
 def read_state(path: Path) -> Any:
-    """Read what ``write_state`` wrote.
+    """Read a state from a file of ``write_state``.
 
     Raises:
         SdcError: the file does not exist, was not written by ``write_state``, or is damaged.
@@ -278,13 +279,13 @@ def read_state(path: Path) -> Any:
 
 
 def _encode(value: Any, place: str, arrays: dict[str, Array]) -> Any:
-    """A value as JSON; arrays are added to ``arrays`` under the path of their place.
+    """Encode a value as JSON data, and add its arrays to ``arrays`` by their path in the state.
 
-    A type that JSON lacks becomes a dict with one key that begins with ``$``.
+    A value of a type that JSON lacks becomes a dict with a single key that begins with ``$``.
     """
     if value is None or isinstance(value, bool | str):
         return value
-    if hasattr(value, "detach"):  # a tensor of PyTorch, which reading settings does without
+    if hasattr(value, "detach"):  # a torch tensor, recognised without importing PyTorch
         return {"$tensor": _stored(value.detach().numpy(), place, arrays)}
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
         return {"$text": value.tolist()}
@@ -308,7 +309,7 @@ def _encode(value: Any, place: str, arrays: dict[str, Array]) -> Any:
 
 
 def _decode(node: Any, arrays: Mapping[str, Array]) -> Any:
-    """The value of a node that ``_encode`` made."""
+    """Decode JSON data that ``_encode`` returned."""
     if isinstance(node, list):
         return [_decode(part, arrays) for part in node]
     if not isinstance(node, dict):
@@ -334,7 +335,7 @@ def _decode(node: Any, arrays: Mapping[str, Array]) -> Any:
 
 
 def _stored(array: Array, place: str, arrays: dict[str, Array]) -> str:
-    """Add an array to ``arrays`` under a new name, and return the name."""
+    """Add an array to ``arrays`` under an unused name, and return the name."""
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{place}: states hold no arrays of {array.dtype}")
     name = place if place not in arrays else f"{place}#{len(arrays)}"
@@ -343,7 +344,7 @@ def _stored(array: Array, place: str, arrays: dict[str, Array]) -> str:
 
 
 def _checksum(text: str, arrays: Mapping[str, Array]) -> int:
-    """CRC-32 of the text and of the arrays in the order of their names."""
+    """Return the CRC-32 of the text followed by the arrays in the order of their names."""
     check = zlib.crc32(text.encode())
     for _, array in sorted(arrays.items()):
         check = zlib.crc32(array.reshape(-1).view(np.uint8).data, check)
