@@ -11,7 +11,7 @@ import ast
 import inspect
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import cache
 from itertools import pairwise
@@ -384,6 +384,28 @@ class PlantQuantities:
 
 
 @dataclass
+class WaterSideResult(PlantQuantities):
+    """One step of the plants of B data centers, with flows that make-up water is computed from."""
+
+    tower_range_k: F64
+    """Entering less leaving water temperature of the tower, in K, (B,)."""
+    tower_water_kg_s: F64
+    """Condenser water flow, in kg/s, (B,)."""
+    tower_airflow_m3s: F64
+    """Airflow of the tower, in m3/s, (B,)."""
+    humidifier_kg_s: F64
+    """Water that evaporates into outdoor air on its way into the hall, in kg/s, (B,)."""
+
+    def scaled(self, share: F64) -> WaterSideResult:
+        """Means over a step during a share of which, (B,), the plant ran.
+
+        Powers and flows are multiplied with the share; temperatures stay those while it ran.
+        """
+        flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s", "_m3s"))]
+        return replace(self, **{name: getattr(self, name) * share for name in flows})
+
+
+@dataclass
 class RoomQuantities:
     """Heat that the plants leave in the room or fetch from it in one step."""
 
@@ -421,6 +443,14 @@ class BatteryQuantities:
     """Energy delivered by the battery."""
     battery_loss_kwh: Annotated[F64, Quantity("kWh")]
     """Energy that the battery loses."""
+
+
+@dataclass
+class BatteryResult(BatteryQuantities):
+    """One step of the batteries of B data centers."""
+
+    grid_kwh: F64
+    """Energy to buy, load plus charge minus discharge, in kWh, (B,), at least 0."""
 
 
 @dataclass

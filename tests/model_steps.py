@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint, BatteryResult
+from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
 from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters, ChillerPoint, ChillerResult
 from sdc_taichi.plant.workload import MODELS, WorkPoint
-from sdc_taichi.types import Work, fields_of
+from sdc_taichi.types import BatteryResult, Work, fields_of
 
 
 def chiller_step(name: str, load_w: Any, **values: Any) -> ChillerResult:

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model_steps import assert_batch, battery_step, floating_point_errors  # noqa: F401
-from sdc_taichi.plant.battery import BATTERIES, BatteryResult
+from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.types import BatteryResult
 
 FIELDS = tuple(f.name for f in fields(BatteryResult))
 

@@ -18,8 +18,8 @@ from sdc_taichi.plant import chiller
 from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters
 from sdc_taichi.plant.plants import Devices, PlantPoint, water_cooled
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult
-from sdc_taichi.types import F64, fields_of
+from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.types import F64, WaterSideResult, fields_of
 
 TRANE_CAPACITY = (4.007341e-01, 1.148568e-03, 1.049504e-04, 5.574667e-02, -1.646131e-03,
                   1.323200e-03)  # fmt: skip

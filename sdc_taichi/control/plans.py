@@ -20,14 +20,13 @@ from sdc_taichi.plant.battery import (
     BATTERIES,
     BatteryParameters,
     BatteryPoint,
-    BatteryResult,
 )
 from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
 from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
-from sdc_taichi.types import F64, I64, Work
+from sdc_taichi.types import F64, I64, BatteryResult, Work
 
 MOST_AT_ONCE = 256
 """Data centers per kernel call, which bounds the memory of its work space."""

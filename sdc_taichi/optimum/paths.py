@@ -22,10 +22,9 @@ from sdc_taichi.plant.battery import (
     BATTERIES,
     BatteryParameters,
     BatteryPoint,
-    BatteryResult,
 )
 from sdc_taichi.plant.workload import TASKS_PER_STEP
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, BatteryResult
 
 IDLE = "idle commands"
 """Name of the path under idle commands."""

@@ -23,18 +23,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdc_taichi.types import F64, BatteryQuantities, Values
+from sdc_taichi.types import BatteryResult, Values
 
 _ROUND_OFF_SHARE = 1e-12
 """Share of the stored energy that rounding may leave in a battery that is emptied exactly."""
-
-
-@dataclass
-class BatteryResult(BatteryQuantities):
-    """One step of the batteries of B data centers."""
-
-    grid_kwh: F64
-    """Energy to buy, load plus charge minus discharge, in kWh, (B,), at least 0."""
 
 
 class BatteryParameters(NamedTuple):

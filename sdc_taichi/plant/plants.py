@@ -19,13 +19,12 @@ from sdc_taichi.plant.tower import TowerModel, TowerPoint
 from sdc_taichi.plant.water_side import (
     LEAST_OUTDOOR_UNITS,
     WaterSideDesign,
-    WaterSideResult,
     chilled_water_c,
     chilled_water_load_w,
     economiser_share,
     loop_pump_w,
 )
-from sdc_taichi.types import F64, Values, as_array
+from sdc_taichi.types import F64, Values, WaterSideResult, as_array
 
 _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
 """Fall in temperature of air that takes up water, per rise of its humidity ratio, in K."""

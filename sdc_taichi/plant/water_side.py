@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from sdc_taichi.plant.chiller import ChillerParameters
-from sdc_taichi.types import F64, PlantQuantities, Values, as_array
+from sdc_taichi.types import F64, Values, as_array
 
 LEAST_COIL_LOAD = 0.1
 """Load of the coils divided by that at design below which the range of their water is constant."""
@@ -81,28 +81,6 @@ class WaterSideDesign:
     """1 if outdoor air that is too dry is wetted, 0 if it is left outside, (B,)."""
     most_humidity: F64
     """Largest relative humidity of outdoor air at the supply setpoint, 0..1, (B,)."""
-
-
-@dataclass
-class WaterSideResult(PlantQuantities):
-    """One step of the plants of B data centers, with flows that make-up water is computed from."""
-
-    tower_range_k: F64
-    """Entering less leaving water temperature of the tower, in K, (B,)."""
-    tower_water_kg_s: F64
-    """Condenser water flow, in kg/s, (B,)."""
-    tower_airflow_m3s: F64
-    """Airflow of the tower, in m3/s, (B,)."""
-    humidifier_kg_s: F64
-    """Water that evaporates into outdoor air on its way into the hall, in kg/s, (B,)."""
-
-    def scaled(self, share: F64) -> WaterSideResult:
-        """Means over a step during a share of which, (B,), the plant ran.
-
-        Powers and flows are multiplied with the share; temperatures stay those while it ran.
-        """
-        flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s", "_m3s"))]
-        return replace(self, **{name: getattr(self, name) * share for name in flows})
 
 
 def chilled_water_c(setpoint_c: F64, design: WaterSideDesign) -> F64:

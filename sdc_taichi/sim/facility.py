@@ -18,14 +18,12 @@ from sdc_taichi.plant.battery import (
     BATTERIES,
     BatteryParameters,
     BatteryPoint,
-    BatteryResult,
 )
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterPoint
-from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.hall_solver import HallSums
@@ -36,10 +34,12 @@ from sdc_taichi.types import (
     F64,
     QUANTITIES,
     AirIndices,
+    BatteryResult,
     CracQuantities,
     RoomQuantities,
     State,
     WaterQuantities,
+    WaterSideResult,
     as_array,
     fields_of,
     joined,
