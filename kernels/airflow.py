@@ -1,13 +1,14 @@
-"""Air in a hall on a grid of cells: coefficients of the flow, and BiCGSTAB for its linear systems.
+"""Airflow in a hall on a grid of cells: transport coefficients, and BiCGSTAB for linear systems.
 
-Cells that hold air are numbered 0..N-1; index N stands for no cell: its unknown stays zero. Faces
-of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower numbers. The matrix A
-of a system has ``diagonal`` on its diagonal, and -``off_diagonal``, at most 0, in the column of the
-cell beyond each face. With ``through_racks`` air passes the racks: what leaves a back face is the
+Cells that hold air have the numbers 0..N-1. Index N stands for "no cell"; its unknown stays zero.
+The faces of a cell are numbered -x, -y, -z, +x, +y, +z; the neighbours beyond the first three
+have lower numbers than the cell. The matrix A of a system has ``diagonal`` on its diagonal. In the
+column of the cell beyond each face it has -``off_diagonal``, which is at most 0. With
+``through_racks``, air also passes through the racks: the air that leaves a back face carries the
 mean of the unknown over the front of its rack, times the airflow of the face.
 
-One system A x = b, by the preconditioned, stabilised method of bi-conjugate gradients (van der
-Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)). The functions named on the right do each line:
+The solver of one system A x = b is the preconditioned, stabilised biconjugate gradient method (van
+der Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)). Each line names its function on the right:
 
     x <- 0                                                          solve_right_side
     repeat, at most MOST_STARTS times:
@@ -24,11 +25,12 @@ Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)). The functions named on the right 
             p <- r + beta (p - omega v)                             update_search_direction
 
 K = (D + L) D^-1 (D + U) is the diagonal incomplete LU factorisation (Pommerell 1992, dissertation,
-ETH Zurich), L and U being the parts of A below and above its diagonal, racks left out. As r is
-updated and not computed anew in an iteration, it drifts from b - A x: hence the repeated starts,
-which go on from the x that was found. All starts together do at most ``most_iterations``.
+ETH Zurich). L and U are the parts of A below and above its diagonal, without the terms of racks.
+Iterations update r instead of computing it anew, so r drifts from b - A x. The solver therefore
+restarts several times, each time from the x found so far. All starts together do at most
+``most_iterations`` iterations.
 
-Each right side is solved by one thread, so that the number of threads changes no bit.
+One thread solves each right side, so the number of threads does not change any bit of the result.
 """
 
 from functools import cache
@@ -41,7 +43,7 @@ from .compiler.functions import part_of
 from .compiler.named_kernel import define_kernel
 
 WORK_VECTORS = 9
-"""Vectors of N + 1 numbers that a thread works with."""
+"""Work vectors of N + 1 numbers per thread."""
 
 (
     _SOLUTION,  # x
@@ -56,64 +58,65 @@ WORK_VECTORS = 9
 ) = range(WORK_VECTORS)
 
 MOST_STARTS = 20
-"""Most starts for a right side, the first included."""
+"""Maximum number of starts for a right side, including the first."""
 
 SYSTEM_ARGUMENTS = {
-    "serial": Argument("template"),  # on the calling thread alone
-    "through_racks": Argument("template"),  # whether air passes the racks
-    "slices": Argument("i32"),  # parts of the right sides, a thread for each
-    "most_iterations": Argument("i32"),  # for one right side
-    "tolerance": Argument("f64"),  # residual over right side that counts as solved
+    "serial": Argument("template"),  # True: run on the calling thread alone
+    "through_racks": Argument("template"),  # True if air passes through the racks
+    "slices": Argument("i32"),  # number of parts of the right sides, one thread each
+    "most_iterations": Argument("i32"),  # maximum number of iterations for one right side
+    "tolerance": Argument("f64"),  # |r| / |b| at which a system counts as solved
     # The matrix.
-    "beyond": Argument("i32", 2),  # cell beyond each face, N if none, (N + 1, 6)
+    "beyond": Argument("i32", 2),  # cell beyond each face, N for no cell, (N + 1, 6)
     "off_diagonal": Argument("f64", 2),  # coefficient of the cell beyond, at least 0, (N + 1, 6)
     "diagonal": Argument("f64", 1),  # coefficient of the cell itself, (N,)
     "front_offsets": Argument("i32", 1),  # first front face of each rack, and the end, (R + 1,)
     "front_cell": Argument("i32", 1),  # cell before each front face
-    "front_share": Argument("f64", 1),  # share of each front face in the airflow of its rack
+    "front_share": Argument("f64", 1),  # share of its rack's airflow, for each front face
     "back_offsets": Argument("i32", 1),  # first back face of each rack, and the end, (R + 1,)
     "back_cell": Argument("i32", 1),  # cell before each back face
     "back_m3s": Argument("f64", 1),  # airflow out of each back face, m3/s
     # The right sides.
     "source_offsets": Argument("i32", 1),  # first source of each right side, and the end, (T + 1,)
     "source_cell": Argument("i32", 1),  # cell of each source
-    "source": Argument("f64", 1),  # what each source adds to the right side in its cell
+    "source": Argument("f64", 1),  # amount that each source adds to the right side
     # Work space.
     "work": Argument("f64", 3),  # (slices, WORK_VECTORS, N + 1)
-    # Results, and the returns at which the solutions are read.
-    "return_cell": Argument("i32", 1),  # cells before returns
-    "return_m3s": Argument("f64", 1),  # flow out of each of them, m3/s
+    # Results, and the return openings at which the solutions are evaluated.
+    "return_cell": Argument("i32", 1),  # cell before each return face
+    "return_m3s": Argument("f64", 1),  # flow out of each return face, m3/s
     "first_solution": Argument("f64", 1),  # solution of the first right side, (N + 1,)
     "intake": Argument("f64", 2),  # mean solution over the front of each rack, (R, T)
     "returned": Argument("f64", 1),  # flow times solution, summed over the returns, (T,)
     "relative_residual": Argument("f64", 1),  # |r| / |b|, 0 where b is 0, (T,)
-    "iterations": Argument("i32", 1),  # iterations done, (T,)
+    "iterations": Argument("i32", 1),  # number of iterations, (T,)
 }
-"""Arguments of the kernel of ``bicgstab_kernel`` by name, those that are templates first."""
+"""Arguments of the kernel of ``bicgstab_kernel`` by name, template arguments first."""
 
 
 @cache
 def transport_kernel() -> Any:
-    """Kernel that turns a potential into face flows and the coefficients of the tag transport.
+    """Return the kernel that turns a flow potential into face flows and transport coefficients.
 
-    Flow through a face is conductance times the drop in potential. A tag c crosses it as
-    q*(c_P + c_N)/2 + G*(c_P - c_N) with G = max(mixing*speed*conductance, |q|/2): central
-    differences where the mixing keeps them bounded, upwind elsewhere (hybrid scheme of Spalding
-    1972, International Journal for Numerical Methods in Engineering 4(4)). ``speed`` is the mean
-    of both cells.
+    Flow through a face is its conductance times the drop in potential. A tag (passive scalar) c
+    crosses the face at the rate q*(c_P + c_N)/2 + G*(c_P - c_N), with flow q and
+    G = max(mixing*speed*conductance, |q|/2). This is the hybrid scheme (Spalding 1972,
+    International Journal for Numerical Methods in Engineering 4(4)): central differences where the
+    mixing keeps them bounded, upwind differences elsewhere. ``speed`` is the mean of both cells.
 
     Arguments of the kernel:
 
-    - beyond: cell beyond each face, N if none, (N + 1, 6).
-    - conductance_m: free area of each face over the distance of the centres, m, (N + 1, 6).
+    - beyond: cell beyond each face, N for no cell, (N + 1, 6).
+    - conductance_m: free area of each face divided by the distance of the two cell centres, in m,
+      (N + 1, 6).
     - boundary_m3s: flow that leaves the hall through each face, m3/s, (N + 1, 6).
     - area_m2: area of the faces across each axis, m2, (N + 1, 3).
-    - mixing_m: eddy diffusivity over air speed, m.
+    - mixing_m: eddy diffusivity divided by air speed, in m.
     - potential_m2s: potential of the flow, m2/s, (N + 1,).
-    - speed_ms: speed of the air, m/s, written but for the last entry, 0, (N + 1,).
-    - imbalance_m3s: flow out of each cell, m3/s, 0 but for round-off, written, (N,).
-    - off_diagonal: coefficients of the cells beyond the faces, m3/s, written, (N + 1, 6).
-    - diagonal: coefficients of the cells themselves, m3/s, written, (N,).
+    - speed_ms: output, air speed in m/s; the last entry stays 0, (N + 1,).
+    - imbalance_m3s: output, net flow out of each cell in m3/s, 0 up to rounding, (N,).
+    - off_diagonal: output, coefficients of the cells beyond the faces, m3/s, (N + 1, 6).
+    - diagonal: output, coefficients of the cells themselves, m3/s, (N,).
     """
     reals_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
     reals_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -166,9 +169,9 @@ def transport_kernel() -> Any:
 
 @cache
 def bicgstab_kernel() -> Any:
-    """Kernel that solves the linear system for every right side, see the head of this module.
+    """Return the kernel that solves the linear system for every right side by BiCGSTAB.
 
-    SYSTEM_ARGUMENTS are its arguments.
+    The module docstring gives the algorithm. SYSTEM_ARGUMENTS lists the arguments of the kernel.
     """
     return define_kernel("solve_systems", SYSTEM_ARGUMENTS, run_slice, precision="f64")
 
@@ -176,7 +179,7 @@ def bicgstab_kernel() -> Any:
 @ti.func
 @no_type_check
 def run_slice(system: ti.template(), s):
-    """Solve the right sides of slice ``s`` in ``work[s]``."""
+    """Solve the right sides of slice ``s``, with ``work[s]`` as work space."""
     no_cell = system.diagonal.shape[0]
     for vector in range(system.work.shape[1]):
         system.work[s, vector, no_cell] = 0.0
@@ -190,7 +193,7 @@ def run_slice(system: ti.template(), s):
 @ti.func
 @no_type_check
 def factorise(system: ti.template(), s):
-    """Compute 1 / D: D_c = A_cc - sum of A_cb A_bc / D_b over the lower cells b beside c."""
+    """Compute 1 / D: D_c = A_cc - sum of A_cb A_bc / D_b over the lower neighbours b of cell c."""
     cells = system.diagonal.shape[0]
     for c in range(cells):
         pivot = system.diagonal[c]
@@ -208,7 +211,7 @@ def factorise(system: ti.template(), s):
 @ti.func
 @no_type_check
 def precondition(system: ti.template(), s, vector, out):
-    """Set ``out`` to K^-1 times a work vector: D + L forwards, then I + D^-1 U backwards."""
+    """Set ``out`` to K^-1 times a work vector: solve D + L forwards, then I + D^-1 U backwards."""
     cells = system.diagonal.shape[0]
     for c in range(cells):
         total = system.work[s, vector, c]
@@ -242,7 +245,7 @@ def multiply(system: ti.template(), s, vector, out):
 @ti.func
 @no_type_check
 def front_mean(system: ti.template(), s, vector, rack):
-    """Mean of a work vector over the front of a rack, by airflow."""
+    """Return the mean of a work vector over the front of a rack, weighted by airflow."""
     mean = ti.cast(0.0, ti.f64)
     for i in range(system.front_offsets[rack], system.front_offsets[rack + 1]):
         mean += system.front_share[i] * system.work[s, vector, system.front_cell[i]]
@@ -252,7 +255,7 @@ def front_mean(system: ti.template(), s, vector, rack):
 @ti.func
 @no_type_check
 def dot(system: ti.template(), s, a, b):
-    """Scalar product of two work vectors."""
+    """Return the scalar product of two work vectors."""
     total = ti.cast(0.0, ti.f64)
     for c in range(system.diagonal.shape[0]):
         total += system.work[s, a, c] * system.work[s, b, c]
@@ -272,7 +275,7 @@ def load_right_side(system: ti.template(), s, rhs, out):
 @ti.func
 @no_type_check
 def solve_right_side(system: ti.template(), s, rhs):
-    """Solve for right side ``rhs``; store its iterations and its residual over the right side."""
+    """Solve for right side ``rhs``; store the number of iterations and the relative residual."""
     for c in range(system.diagonal.shape[0]):
         system.work[s, _SOLUTION, c] = 0.0
     load_right_side(system, s, rhs, _RESIDUAL)
@@ -309,10 +312,10 @@ def start_iterations(system: ti.template(), s, rhs):
 @ti.func
 @no_type_check
 def iterate(system: ti.template(), s, rho_at_start, goal, iterations_before):
-    """Iterate until |r| is at the goal, iterations are used up, or a divisor is 0.
+    """Iterate until |r| reaches the goal, iterations are used up, or a divisor is 0.
 
     Returns:
-        |r|, and the iterations done since the first start.
+        |r|, and the number of iterations since the first start.
     """
     rho, iterations = rho_at_start, iterations_before
     residual_norm = ti.sqrt(rho)
@@ -346,7 +349,7 @@ def iterate(system: ti.template(), s, rho_at_start, goal, iterations_before):
 @ti.func
 @no_type_check
 def advance(system: ti.template(), s, step, direction, a_direction):
-    """Move x by a step along a direction, and r by what A makes of it."""
+    """Add ``step`` times ``direction`` to x, and subtract A times this change from r."""
     for c in range(system.diagonal.shape[0]):
         system.work[s, _SOLUTION, c] += step * system.work[s, direction, c]
         system.work[s, _RESIDUAL, c] -= step * system.work[s, a_direction, c]
@@ -365,7 +368,7 @@ def update_search_direction(system: ti.template(), s, beta, omega):
 @ti.func
 @no_type_check
 def store_results(system: ti.template(), s, rhs):
-    """Store what is asked of the solution for right side ``rhs``."""
+    """Store rack intakes, returned flow, and the first solution, for right side ``rhs``."""
     for rack in range(system.front_offsets.shape[0] - 1):
         system.intake[rack, rhs] = front_mean(system, s, _SOLUTION, rack)
     total = ti.cast(0.0, ti.f64)

@@ -1,4 +1,4 @@
-"""Specs of kernel arguments: types, and named rows of arrays. This module imports no Taichi."""
+"""Specs of kernel arguments: types and named array rows. This module does not import Taichi."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -7,36 +7,36 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Argument:
-    """Type of an argument, and for arrays of named rows what they hold."""
+    """Type of a kernel argument and, for an array with named rows, the meaning of its rows."""
 
     kind: str
     """``template``, ``i32``, ``f64``, or ``real``, which is f32 or f64 by the kernel's precision.
-    For each value of a template the kernel is compiled apart."""
+    Taichi compiles one kernel for each value of a template argument."""
     ndim: int = 0
-    """Dimensions of the array; 0 for a number."""
+    """Number of dimensions of the array; 0 for a scalar."""
     lanes: int = 1
-    """Numbers in an element of the array; more than 1 for vectors."""
+    """Length of the vector in each element of the array; 1 for scalar elements."""
     rows: Mapping[str, str] = field(default_factory=dict)
-    """Meaning of each named row. Arrays of two dimensions have a row for each; in those of one
-    dimension the values of an item stand next to each other."""
+    """Meaning of each named row. An array of two dimensions has one row for each name. In an array
+    of one dimension the values of an item are adjacent."""
     of: str = ""
-    """Items whose values the rows are, by their name in the kernel."""
+    """Name within the kernel of the items to which the rows belong, such as ``racks``."""
 
 
 def row_index(rows: Iterable[str], name: str) -> int:
-    """Place of a named row in its array.
+    """Return the index of a named row in its array.
 
     Raises:
-        ValueError: a name that is no row.
+        ValueError: if the name is not a row.
     """
     return list(rows).index(name)
 
 
 def in_row_order(rows: Mapping[str, str], values: Mapping[str, Any]) -> list[Any]:
-    """Values of all named rows, in the order of ``rows``.
+    """Return the values of all named rows, in the order of ``rows``.
 
     Raises:
-        ValueError: naming the rows that are missing and the names that are no row.
+        ValueError: if rows are missing or names are unknown; the message lists both.
     """
     if rows.keys() != values.keys():
         missing, unknown = rows.keys() - values.keys(), values.keys() - rows.keys()

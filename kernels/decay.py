@@ -1,7 +1,8 @@
-"""Exponential decay of vectors: phi1 = (1 - exp(-x)) / x, exact to the last digits of small x.
+"""Exponential decay of vectors: phi1 = (1 - exp(-x)) / x, to full precision also for small x.
 
-A difference from the exponential of ``elementary.py`` would lose those digits. Larger x are halved
-until the series holds, and the result is doubled as often.
+Subtracting the exponential of ``elementary.py`` from 1 would lose digits for small x. The series
+of phi1 is summed instead. A large x is first halved until the series converges; a formula for
+doubled arguments then undoes each halving.
 """
 
 from math import factorial
@@ -10,22 +11,22 @@ from typing import no_type_check
 import taichi as ti
 
 SERIES_TO = 0.25
-"""Largest x for which the series is summed."""
+"""Largest x for which the series is summed directly."""
 SERIES_TERMS = {"f32": 6, "f64": 12}
-"""Terms of the series that give the last digit up to SERIES_TO; an even number."""
+"""Number of series terms (even) that gives full precision for x up to SERIES_TO."""
 MOST_HALVINGS = 60
-"""Halvings of larger x; a decay that lasts longer is at its end."""
+"""Maximum number of halvings of x; a longer decay has practically reached its final value."""
 
 
 def decay_series(precision: str) -> tuple[float, ...]:
-    """Coefficients of the series of (1 - exp(-x)) / x, highest power first."""
+    """Return the coefficients of the series of (1 - exp(-x)) / x, highest power first."""
     return tuple((-1.0) ** k / factorial(k + 1) for k in reversed(range(SERIES_TERMS[precision])))
 
 
 @ti.func
 @no_type_check
 def halvings_for(hall: ti.template(), most):
-    """How often ``most``, a number, is halved to be where the series holds."""
+    """Return how many halvings bring the scalar ``most`` down to SERIES_TO or less."""
     count = 0
     while most > hall.real(SERIES_TO) and count < MOST_HALVINGS:
         most *= hall.real(0.5)
@@ -36,7 +37,7 @@ def halvings_for(hall: ti.template(), most):
 @ti.func
 @no_type_check
 def power_of_half(hall: ti.template(), halvings):
-    """0.5 to the power ``halvings``."""
+    """Return 0.5 to the power ``halvings``."""
     x, i = hall.real(1.0), 0
     while i < halvings:
         x *= hall.real(0.5)
@@ -47,11 +48,11 @@ def power_of_half(hall: ti.template(), halvings):
 @ti.func
 @no_type_check
 def phi1(hall: ti.template(), y, halvings):
-    """(1 - exp(-x)) / y with x = y * 2^halvings and y >= 0, a vector.
+    """Return (1 - exp(-x)) / y for a vector y >= 0, with x = y * 2^halvings.
 
-    With 1 - exp(-2a) = (1 - exp(-a)) (2 - (1 - exp(-a))), each halving is undone.
+    Each halving is undone by 1 - exp(-2a) = (1 - exp(-a)) (2 - (1 - exp(-a))).
     """
-    # Terms in pairs, since each addition waits for the one before.
+    # Sum the terms in pairs: it shortens the chain of dependent additions.
     square = y * y
     value = y * hall.real(hall.decay_series[0]) + hall.real(hall.decay_series[1])
     for i in ti.static(range(2, len(hall.decay_series), 2)):

@@ -1,8 +1,8 @@
-"""Logarithm and exponential of vectors of the processor.
+"""Logarithm and exponential of SIMD vectors.
 
-Taichi has them for single numbers, as calls that take four to ten times as long per lane. Both are
-series without branches, the same for all lanes, so that results never depend on a lane's
-neighbours. Both err by at most three units in the last digit.
+Taichi has both functions for scalars only, as calls that take four to ten times as long per lane.
+The functions here sum a series without branches. All lanes do the same operations, so a result
+never depends on neighbouring lanes. The error is at most three units in the last digit.
 """
 
 from functools import cache
@@ -14,23 +14,23 @@ import taichi as ti
 from .compiler.functions import larger, smaller
 
 _FORMATS = {"f32": (23, 127), "f64": (52, 1023)}
-"""Bits of the fraction, and bias of the exponent (IEEE 754)."""
+"""Number of fraction bits, and bias of the exponent, of each IEEE 754 format."""
 _LOG_TERMS = {"f32": 5, "f64": 11}
-"""Terms of the logarithm; the first left out is less than a quarter of the sum's last digit."""
+"""Terms of the logarithm; the first omitted term is below a quarter of the sum's last digit."""
 _EXP_TERMS = {"f32": 8, "f64": 14}
-"""Terms of the exponential; the first left out is less than a quarter of the sum's last digit."""
+"""Terms of the exponential; the first omitted term is below a quarter of the sum's last digit."""
 _LOG_2 = log(2.0)
 _LOG_2_HIGH, _LOG_2_LOW = 355.0 / 512.0, -2.121944400546905827679e-4
-"""Log 2 as a sum of two (Cody and Waite 1980); the first has few bits, so that its products with
-whole numbers are exact."""
+"""Logarithm of 2 as the sum of a high and a low part (Cody and Waite 1980). The high part has few
+bits, so its products with whole numbers are exact."""
 
 
 @cache
 def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
-    """Taichi functions of a vector, (lanes,): its natural logarithm, and its exponential.
+    """Return Taichi functions for the natural logarithm and the exponential of vectors (lanes,).
 
-    Both stay within normal numbers: the logarithm of 0 is that of the smallest, and x times a power
-    of x is 0 where x is.
+    Both avoid subnormal numbers, infinities and NaN: the logarithm of 0 is that of the smallest
+    normal number, so x times a power of x is 0 for x = 0.
     """
     real, whole = {"f32": (ti.f32, ti.i32), "f64": (ti.f64, ti.i64)}[precision]
     fraction_bits, bias = _FORMATS[precision]
@@ -49,7 +49,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
     @ti.func
     @no_type_check
     def log_of(x):
-        """Logarithm of 2^e m with m in [3/4, 3/2); log m = 2 atanh((m - 1) / (m + 1))."""
+        """Return log(2^e m) for m in [3/4, 3/2), by log m = 2 atanh((m - 1) / (m + 1))."""
         normal = larger(x, ti.Vector([real(2.0 ** (1 - bias))] * lanes))
         bits = ti.Vector([ti.cast(0, whole)] * lanes)
         for i in range(lanes):
@@ -69,7 +69,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
     @ti.func
     @no_type_check
     def exp_of(x):
-        """Exponential of k log 2 + r with r at most half of log 2."""
+        """Return exp(k log 2 + r), with whole k and r at most half of log 2 in magnitude."""
         low = ti.Vector([real((1.5 - bias) * _LOG_2)] * lanes)
         high = ti.Vector([real(bias * _LOG_2)] * lanes)
         within = smaller(larger(x, low), high)

@@ -1,7 +1,7 @@
-"""The sweep: every server group of a hall once, then its CRAC units and its exhaust mixes.
+"""Kernel of the hall: a sweep computes every server group once, then CRAC units and exhaust mixes.
 
-One sweep of a data center, in the symbols of docs/hall.md, T_mix,j and f_k being those of the sweep
-before (the functions named on the right do each line):
+One sweep of a data center, in the symbols of docs/hall.md. T_mix,j and f_k are those of the
+previous sweep. Each line names its function on the right:
 
     for each rack j:                                                        compute_block
         for each group of alike servers, g its height factor, u its load:   compute_groups
@@ -11,7 +11,7 @@ before (the functions named on the right do each line):
         V_j      <- sum V,  P_j <- sum (P - C dT/dt)
         T_in,j   <- sum V T_in / V_j
         T_out,j  <- T_in,j + P_j / (rho c_p V_j)
-        what j gives to the mixes <- T_out,j, less with failing fans        store_exhaust
+        exhaust of rack j <- T_out,j, less with failing fans                store_exhaust
     for each CRAC unit k:                                                   run_crac_units
         need_k   <- sum_j s_jk (1 - r_j) V_j
         V_k      <- clip(need_k / (1 - b_0), low V_k,full, high V_k,full)
@@ -21,10 +21,10 @@ before (the functions named on the right do each line):
     T_ret  <- (sum_j V_j T_out,j - sum_j r'_j V_j T_mix,j + V_bypass T_sup) / V_crac
     T_mix,j  <- sum_i w_ji T_out,i                                          mixes.py
 
-In steady air sweeps repeat until one more would move no mix by more than ``tolerance_k``, at most
-``sweeps`` times. In transient halls a sweep is a substep: room air before the racks follows its mix
-(``advance_parcels``), and the coils set the supply air of the next substep (``run_coils``). With
-inlet model ``approach`` there is one sweep, T_in,j = T_sup + a_j.
+In steady air, sweeps repeat until another sweep would change no mix by more than ``tolerance_k``,
+at most ``sweeps`` times. In transient halls a sweep is a substep: the room air before the racks
+follows its mix (``advance_parcels``), and the coils set the supply air of the next substep
+(``run_coils``). The inlet model ``approach`` needs one sweep, with T_in,j = T_sup + a_j.
 
 README.md in this folder explains blocks, chunks, tasks, and the loops that advance by ``hall.one``.
 """
@@ -84,25 +84,25 @@ from .units import (
 )
 
 END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
-"""Row behind the last sum of transient halls, which do not ask for the sum of the outlets."""
+"""End of the rows of sums in transient halls, which do not need the sum of the outlets."""
 
 
 @ti.func
 @no_type_check
 def describe_sweep(hall: ti.template(), n, exchanges_after, reference_c):
-    """State of a data center before a sweep, as functions of the sweep need it."""
+    """Return the state of a data center before a sweep, as a struct for functions of the sweep."""
     dc = hall.dcs[n]
     sweep = ti.Struct(
         is_first=dc.sweep == 0,
-        # Known beforehand of substeps alone.
+        # In steady air, the last sweep is known only once the sweeps have converged.
         is_last=dc.sweep == hall.sweeps - 1,
-        # Whether exhausts are exchanged before the racks are computed, or after.
+        # True: exchange the exhausts before computing the racks (or after them).
         exchanges_before=dc.exchanges_before != 0,
         exchanges_after=exchanges_after,
-        # The side of the exhausts that the last exchange reads; racks write the other one.
+        # Side of the exhaust arrays that the last exchange reads; racks write the other side.
         side=dc.exhaust_side,
         shift_k=ti.cast(dc.shift_k, hall.real),
-        # Supply air, which mixes are computed over where they are computed as differences.
+        # Supply air, the reference temperature where mixes are computed as differences.
         reference_c=reference_c,
     )
     if sweep.exchanges_before:
@@ -121,7 +121,7 @@ def update_mixes(
     servers: ti.template(),
     amounts,
 ):
-    """Mixes before all racks of a chunk, so that no block waits for one before it."""
+    """Set the mixes before all racks of a chunk, so that no block depends on an earlier block."""
     if ti.static(hall.transient):
         advance_parcels(hall, n, chunk_at, block_terms_0, sweep, servers)
     elif ti.static(hall.recirculates):
@@ -136,9 +136,9 @@ def update_mixes(
 def begin_terms(
     hall: ti.template(), terms_at, sweep: ti.template(), is_one_chunk, hottest: ti.template()
 ):
-    """Set the TERMS of a chunk and its hottest inlets to none.
+    """Reset the TERMS of a chunk, and its hottest inlets, before a sweep.
 
-    A data center of one chunk keeps those of the whole step in its lanes over the substeps.
+    A data center of one chunk keeps its sums of the whole step in its lanes during the substeps.
     """
     row = terms_at
     keeps = False
@@ -163,11 +163,11 @@ def store_chunk(
     is_one_chunk,
     hottest: ti.template(),
 ):
-    """Sums of a chunk after a sweep, those alone that are wanted by now.
+    """Store those sums of a chunk that are needed right after this sweep.
 
-    What is wanted at the end of the step alone waits for the last substep; in steady air, whose
-    last sweep is known afterwards, for ``finish_sweep``. Chunks whose data center has others cannot
-    keep TERMS in their lanes, and sum them up after every sweep.
+    Sums that only the end of the step needs wait for the last substep. In steady air they wait for
+    ``finish_sweep``, as the last sweep is known only afterwards. A chunk of a data center with
+    several chunks cannot keep TERMS in its lanes, so it sums them up after every sweep.
     """
     first_row, adds, end_row = 0, False, END_OF_TERMS
     if ti.static(hall.transient):
@@ -198,7 +198,7 @@ def compute_chunk(
     hottest: ti.template(),
     amounts,
 ):
-    """Racks of a chunk in a sweep, and their sums; ``is_one_chunk``: it is all of its hall."""
+    """Compute and sum the racks of a chunk in a sweep; ``is_one_chunk``: no other in its hall."""
     block_terms_0 = terms_at + N_TERMS
     begin_terms(hall, terms_at, sweep, is_one_chunk, hottest)
     update_mixes(hall, n, chunk_at, block_terms_0, sweep, servers, amounts)
@@ -233,7 +233,7 @@ def compute_chunk(
 @ti.func
 @no_type_check
 def is_last_chunk(hall: ti.template(), n, n_chunks):
-    """Whether a chunk that has just been computed is the last of its data center in this sweep."""
+    """Return True if a chunk just computed is the last of its data center in this sweep."""
     is_last = True
     if n_chunks > 1:
         is_last = ti.atomic_add(hall.dcs[n].chunks_done, 1) == n_chunks - 1
@@ -245,7 +245,7 @@ def is_last_chunk(hall: ti.template(), n, n_chunks):
 @ti.func
 @no_type_check
 def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
-    """CRAC units at what the racks need; status of the data center, and its next mixes."""
+    """Run the CRAC units at the racks' need; set status and next mixes of the data center."""
     dc = hall.dcs[n]
     total, sweep = hall.chunks[dc.first_chunk], dc.sweep
     is_last = sweep + 1 >= hall.sweeps
@@ -258,7 +258,7 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     air.units_return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
     dc.crac_m3s_per_rack = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
-    # All mixes move by the middle of the exhausts' changes, give or take half their spread.
+    # All mixes move by the midpoint of the exhausts' changes, up to half the spread of the changes.
     change_k = 0.5 * (total.least_change_k + total.most_change_k)
     spread_k = 0.5 * (total.most_change_k - total.least_change_k)
     exchanges = spread_k > ALIKE * hall.tolerance_k
@@ -289,7 +289,7 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
 @ti.func
 @no_type_check
 def running_mean(hall: ti.template(), is_first, before, value):
-    """Mean over the substeps, of which ``before`` is the part so far; in steady air the value."""
+    """Return the mean over the substeps so far, added to ``before``; in steady air ``value``."""
     mean = value * hall.weight
     if not is_first:
         mean += before
@@ -299,7 +299,7 @@ def running_mean(hall: ti.template(), is_first, before, value):
 @ti.func
 @no_type_check
 def store_air(hall: ti.template(), n, is_first, air: ti.template()):
-    """Air that the CRAC units give and take, and heat at their coils, to DC_OUT."""
+    """Store supply and return air of the CRAC units, and heat at their coils, in DC_OUT."""
     dc = hall.dcs[n]
     supplied_m3k_s = hall.chunks[dc.first_chunk].flow_m3s * air.supply_c
     dc.inlet_m3k_s = running_mean(hall, is_first, dc.inlet_m3k_s, supplied_m3k_s)
@@ -313,9 +313,9 @@ def store_air(hall: ti.template(), n, is_first, air: ti.template()):
 @ti.func
 @no_type_check
 def store_results(hall: ti.template(), n):
-    """Sums and means over the racks of a data center that is at its end, to DC_OUT.
+    """Store sums and means over the racks of a data center in DC_OUT at the end of its step.
 
-    After ``store_air``, which leaves airflow times supply air in ``inlet_m3k_s``.
+    ``store_air`` must run first: it leaves airflow times supply air in ``inlet_m3k_s``.
     """
     dc, first = hall.dcs[n], hall.dcs[n].first_chunk
     total, n_racks = hall.chunks[first], ti.cast(dc.racks, ti.f64)
@@ -346,7 +346,7 @@ def store_results(hall: ti.template(), n):
 @ti.func
 @no_type_check
 def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hottest: ti.template()):
-    """End of a sweep of a data center, after its last chunk, and at its own end its results."""
+    """Finish a sweep after the last chunk of a data center; store results if it was the last."""
     combine_chunks(hall, n)
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
     air = ti.Struct(
@@ -375,9 +375,9 @@ def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hotte
 @ti.func
 @no_type_check
 def run_task(hall: ti.template(), terms_at, first_chunk, end_chunk):
-    """All sweeps of a data center, or one sweep of some of its chunks.
+    """Run all sweeps of a data center, or one sweep of some of its chunks.
 
-    Chunks of a data center that is cut into tasks wait for each other after every sweep.
+    A data center that is split into several tasks synchronises its chunks after every sweep.
     """
     n = hall.chunks[first_chunk].dc
     dc = hall.dcs[n]
@@ -421,7 +421,7 @@ def run_task(hall: ti.template(), terms_at, first_chunk, end_chunk):
 @ti.func
 @no_type_check
 def run_slice(hall: ti.template(), slice_at):
-    """The tasks of one of equal parts of all tasks."""
+    """Run the tasks of slice ``slice_at``, one of ``slices`` equal parts of all tasks."""
     n_tasks = hall.task_offsets.shape[0] - 1
     first, end = part_of(slice_at, hall.slices, n_tasks)
     for task in range(first, end):
@@ -431,13 +431,13 @@ def run_slice(hall: ti.template(), slice_at):
 
 @cache
 def hall_kernel(precision: str) -> Any:
-    """Kernel of a step: all data centers, until they are at their ends or wait for each other.
+    """Return the kernel of a step; it runs all data centers until each is done or synchronises.
 
-    A data center whose chunks are one task runs all its ``sweeps`` in one call, others one per
-    call. STEP_ARGUMENTS are its arguments.
+    A data center whose chunks form one task runs all its ``sweeps`` in one call. Other data centers
+    run one sweep per call. STEP_ARGUMENTS lists the arguments of the kernel.
 
     Args:
-        precision: ``f32`` or ``f64``, of temperatures and powers; sums are in f64.
+        precision: ``f32`` or ``f64``, of temperatures and powers; sums are always in f64.
     """
     log_of, exp_of = log_and_exp(precision, LANES)
     return define_kernel(

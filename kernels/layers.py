@@ -1,4 +1,4 @@
-"""Values of single servers after a step: inlet, outlet and power, group by group."""
+"""Kernel of per-server values after a step: inlet, outlet and power, computed group by group."""
 
 from functools import cache
 from typing import Any, no_type_check
@@ -25,7 +25,7 @@ FIRST_GROUP, FIRST_SERVER = (row_index(PLACE_INTS, name) for name in PLACE_INTS)
 @ti.func
 @no_type_check
 def store_vector(hall: ti.template(), b, inlet_c, outlet_c, power_w):
-    """Store a vector of servers, of place b among the vectors of the layers."""
+    """Store the values of a vector of servers at index b of the per-server vectors."""
     hall.inlet_vectors[b] = inlet_c
     hall.outlet_vectors[b] = outlet_c
     hall.power_vectors[b] = power_w
@@ -34,11 +34,11 @@ def store_vector(hall: ti.template(), b, inlet_c, outlet_c, power_w):
 @ti.func
 @no_type_check
 def spread_to_servers(hall: ti.template(), block_at, values_at):
-    """Copy the values of the groups of a block to their servers, nearly all in whole vectors."""
+    """Copy the values of the groups of a block to their servers, mostly in whole vectors."""
     block, place_0 = hall.blocks[block_at], block_at * LANES
     start = hall.places[place_0].first_server
     end = hall.places[place_0 + block.racks].first_server
-    # Between these are the vectors that the block has to itself.
+    # Vectors from low to high contain servers of this block only.
     low, high = (start + (LANES - 1)) & -LANES, end & -LANES
     numbers = ti.Vector([i for i in range(LANES)])
     joined = ti.Struct(inlet_c=hall.zeros, outlet_c=hall.zeros, power_w=hall.zeros)
@@ -54,7 +54,7 @@ def spread_to_servers(hall: ti.template(), block_at, values_at):
             power_w = values.power_w[lane]
             inlets, outlets = ti.Vector([inlet_c] * LANES), ti.Vector([outlet_c] * LANES)
             powers = ti.Vector([power_w] * LANES)
-            # The vector where a run begins has the ends of those before.
+            # The vector in which a run of servers begins also contains the end of earlier runs.
             before = numbers < (s & (LANES - 1))
             joined.inlet_c = ti.select(before, joined.inlet_c, inlets)
             joined.outlet_c = ti.select(before, joined.outlet_c, outlets)
@@ -86,7 +86,7 @@ def spread_to_servers(hall: ti.template(), block_at, values_at):
 def broadcast_rack(
     racks: ti.template(), air: ti.template(), lane, of_racks: ti.template(), of_air: ti.template()
 ):
-    """One rack of a block and the air before it, in all lanes, for groups of that rack."""
+    """Copy the values of one rack, and of its intake air, to all lanes, for groups of that rack."""
     of_racks.deviation_scale = ti.Vector([racks.deviation_scale[lane]] * LANES)
     of_racks.cpu_base = ti.Vector([racks.cpu_base[lane]] * LANES)
     of_racks.fan_base = ti.Vector([racks.fan_base[lane]] * LANES)
@@ -111,10 +111,11 @@ def compute_values(
     z,
     server_c,
 ):
-    """Inlet, outlet and power of groups in the last sweep, or at the end of the last substep.
+    """Return inlet, outlet and power of groups in the last sweep, or after the last substep.
 
-    A server gives T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with
-    its own temperature T_s and the supply air that follows the last substep.
+    The outlet of a server is T + P/(rho*cp*V). In transient halls it is
+    T + eps (T_s - T) + P_fan/(rho*cp*V), with the server temperature T_s and the inlet T from the
+    supply air after the last substep.
     """
     inlet_c, cpu_w, airflow, fan_power = compute_group(hall, servers, racks, air, group, z)
     flow_m3s = airflow * racks.full_m3s
@@ -129,11 +130,11 @@ def compute_values(
 @ti.func
 @no_type_check
 def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.template(), offset_row):
-    """Compute the groups of a block and store their values, to servers or to groups once.
+    """Compute the groups of a block and store their values, once per server or once per group.
 
-    Lanes are racks, whose values are then copied to runs of servers. Where each group has one place
-    in the layers, lanes are groups of one rack, which are stored as they lie. ``offset_row``: the
-    row of PLACE_INTS that tells where the layers of a rack begin.
+    If layers have one value per server, lanes are racks, and their values are copied to runs of
+    servers. If they have one value per group, lanes are groups of one rack, stored directly.
+    ``offset_row`` is the row of PLACE_INTS with the first index of a rack in the layers.
     """
     block, place_0 = hall.blocks[block_at], block_at * LANES
     place_1 = place_0 + block.racks
@@ -142,7 +143,7 @@ def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.templat
     in_runs = n_values > n_groups
     racks = rack_model(hall, servers, block_at)
     air = intake_air(hall, n, block_at, block.mixed_c, FRESH_RATIO_USED)
-    # One pass over all racks at once, or a pass for each rack.
+    # One pass computes all racks of the block, or each pass computes one rack.
     passes, row, n_vectors, rack = 1, block.first_row, block.groups, 0
     if not in_runs:
         passes, row = block.racks, block.first_row_along
@@ -193,7 +194,7 @@ def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.templat
 @ti.func
 @no_type_check
 def server_temperatures(hall: ti.template(), block_at, rack, z, in_runs):
-    """Temperatures of the servers of group z of all racks of a block, or of a rack from z on."""
+    """Return server temperatures: group z of all racks, or the groups from z on of one rack."""
     block = hall.blocks[block_at]
     server_c = hall.zeros
     if in_runs:
@@ -208,7 +209,7 @@ def server_temperatures(hall: ti.template(), block_at, rack, z, in_runs):
 @ti.func
 @no_type_check
 def write_chunk(hall: ti.template(), chunk_at, values_at):
-    """Values of the servers of a chunk, or of each of its groups once."""
+    """Write per-server values of a chunk, once per server or once per group."""
     chunk = hall.chunks[chunk_at]
     servers = server_model(hall, chunk.dc)
     offset_row = FIRST_SERVER
@@ -221,7 +222,7 @@ def write_chunk(hall: ti.template(), chunk_at, values_at):
 @ti.func
 @no_type_check
 def write_slice(hall: ti.template(), slice_at):
-    """The chunks of one of equal parts of all chunks."""
+    """Write the chunks of slice ``slice_at``, one of ``slices`` equal parts of all chunks."""
     first, end = part_of(slice_at, hall.slices, hall.chunk_ints.shape[1] - 1)
     values_at = slice_at * (hall.group_values.shape[1] // hall.slices)
     for chunk_at in range(first, end):
@@ -230,9 +231,9 @@ def write_slice(hall: ti.template(), slice_at):
 
 @cache
 def layers_kernel(precision: str) -> Any:
-    """Kernel that computes all groups of the last step again and stores their values by server.
+    """Return the kernel that recomputes the groups of the last step and stores per-server values.
 
-    LAYERS_ARGUMENTS are its arguments.
+    LAYERS_ARGUMENTS lists its arguments.
 
     Args:
         precision: ``f32`` or ``f64``.

@@ -1,21 +1,22 @@
-"""The exhaust mixes before the racks: their first guess, their exchange, and when sweeps may stop.
+"""Exhaust mixes before the racks: first guess, exchange, and the convergence test of sweeps.
 
-The mix before rack j is T_mix,j = sum_i w_ji T_out,i, where the weights w_ji of a rack sum to 1. To
-*exchange* is to compute the mixes from the outlets.
+The mix before rack j is T_mix,j = sum_i w_ji T_out,i; the weights w_ji of a rack sum to 1. An
+*exchange* computes the mixes from the outlets.
 
-*Dense* halls, of up to 64 racks, keep every weight and, in steady air, exchange after each sweep.
-The change d of the mixes then says exactly how far the next sweep would move them. Racks answer
-warmer air with a share k of its change, the feedback gain, so the mixes would go on to move by
-k W d, k^2 W^2 d, and so on. The next sweep starts from d + k/(1 - k) W d at once (Aitken 1926).
-Example: two racks that take in half of each other's exhaust (all w_ji = 0.5) and answer with
-k = 0.2. A sweep finds the mixes 1.0 K and 0.6 K warmer, d = (1.0, 0.6); W d = (0.8, 0.8); the mixes
-are moved by (1.0, 0.6) + 0.25 (0.8, 0.8) = (1.2, 0.8), which is where all later sweeps would lead.
+*Dense* halls, of up to 64 racks, store every weight and, in steady air, exchange after each sweep.
+The change d of the mixes is then exactly the change that the next sweep would see. Racks respond to
+warmer air with a share k of its change, the feedback gain. Without acceleration, the mixes would
+further change by k W d, k^2 W^2 d, and so on. The next sweep therefore starts from the sum, about
+d + k/(1 - k) W d (Aitken 1926). Example: two racks take in half of each other's exhaust (all
+w_ji = 0.5) and respond with k = 0.2. A sweep finds the mixes 1.0 K and 0.6 K warmer, d = (1.0, 0.6)
+and W d = (0.8, 0.8). The mixes move by (1.0, 0.6) + 0.25 (0.8, 0.8) = (1.2, 0.8), which is the
+limit of all later sweeps.
 
-In *sparse* halls an exchange costs more than a sweep. A mix moves by no more than the exhausts have
-moved since the last exchange. Example: if all exhausts have moved by 0.95 to 1.05 K, each mix would
-move by 1.00 K, give or take 0.05 K. If that spread is below ``ALIKE`` of the tolerance, the mixes
-are shifted by 1.00 K and nothing is exchanged; if the shifted mixes would move by less than the
-tolerance, the sweeps end.
+In *sparse* halls an exchange costs more than a sweep. A mix changes by no more than the exhausts
+have changed since the last exchange. Example: if all exhausts have changed by 0.95 to 1.05 K, each
+mix would change by 1.00 K, up to 0.05 K more or less. If this spread is below ``ALIKE`` times the
+tolerance, the mixes are shifted by 1.00 K without an exchange. The sweeps end when the shifted
+mixes would change by less than the tolerance.
 """
 
 from typing import no_type_check
@@ -42,31 +43,31 @@ from .hall_arguments import (
 from .sums import store_change_range
 
 EXHAUST_ROW = row_index(RACK_STATE, "exhaust_c")
-"""Row of side 0 of the exhausts; side 1 is the next one."""
+"""Row of side 0 of the exhausts; the next row is side 1."""
 MIX_INPUT_ROW = row_index(RACK_STATE, "mix_input_k")
 ALIKE = 0.25
-"""Where the outlets' moves since the last exchange differ from their middle by less than this share
-of the tolerance, the mixes are shifted instead of exchanged; they err by no more than that, which
-leaves the sweeps room to converge within the tolerance."""
+"""Largest spread of outlet changes, as a share of the tolerance, for a shift of the mixes instead
+of an exchange. Spread is the deviation from the midpoint of the changes since the last exchange. It
+bounds the error of the mixes, and sweeps can still converge within the tolerance."""
 MOST_GAIN_EXPECTED, MOST_GAIN_SEEN = 0.5, 0.75
-"""Highest feedback gain that is trusted, from the table and as the last sweep showed: the step that
-sums all feedback at once is then at most 2 and 4 times the sweep's own. Bounds against overshoot
-where the airflow curves bend; a sweep that takes no such step never overshoots."""
+"""Largest feedback gain that is used, from the table and as seen in the last sweep. The step that
+sums up all feedback is then at most 2 and 4 times the plain step. These bounds prevent overshoot
+at the bends of the airflow curves; a plain step never overshoots."""
 GAIN_SEEN_FROM = 32.0
-"""Moves of fewer tolerances than this are too coarse in f32 to tell the feedback gain."""
+"""Smallest change, in tolerances, from which the feedback gain is estimated; f32 limits it."""
 PLAIN_EVERY = 4
-"""One sweep in so many takes its own step alone, so that a wrong gain cannot go on for ever."""
+"""Period, in sweeps, of plain steps without feedback, so that a wrong gain cannot persist."""
 STILL_PER_S = 1.0 / 128.0
-"""Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
-the room; a power of two, exact in both precisions."""
+"""Fastest rate at which CRAC air stirs the air before racks without airflow, in 1/s, as in a room
+without fans. It is a power of two, hence exact in both precisions."""
 
 
 @ti.func
 @no_type_check
 def catmull_rom(x):
-    """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
+    """Return weights of four points for position x between the inner two (Catmull and Rom 1974).
 
-    Racks loaded alike take fewer sweeps from a cubic than from a straight line.
+    Cubic interpolation saves sweeps of evenly loaded racks, compared to linear interpolation.
     """
     return ti.Vector(
         [
@@ -81,9 +82,10 @@ def catmull_rom(x):
 @ti.func
 @no_type_check
 def look_up_steady_state(hall: ti.template(), n):
-    """Amounts of the patterns in the steady state by the table, a vector, and the feedback gain.
+    """Look up the steady state: return pattern amounts as a vector, and set the feedback gain.
 
-    By the supply air of the first unit; that of the others is near enough to start from.
+    The table is read at the supply air of the first unit, which approximates the other units well
+    enough for a first guess.
     """
     dc = hall.dcs[n]
     rows, columns = dc.supply_rows, hall.load_columns
@@ -107,9 +109,9 @@ def look_up_steady_state(hall: ti.template(), n):
 @ti.func
 @no_type_check
 def guess_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
-    """First guess of the exhaust mix before the racks of a block, in C.
+    """Return the first guess of the exhaust mix before the racks of a block, in C.
 
-    In sparse halls also of the exhausts, which the next exchange is held against.
+    In sparse halls, also store a first guess of the exhausts, the reference of the next exchange.
     """
     block, chunk_0 = hall.blocks[block_at], hall.dcs[n].first_chunk
     pattern_at = hall.dcs[n].first_pattern
@@ -132,7 +134,7 @@ def guess_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
 @ti.func
 @no_type_check
 def dense_mix(hall: ti.template(), weight_at, source_at, count):
-    """Weights of a block of a dense hall times a row of all racks of the hall, a vector."""
+    """Return the weights of a block of a dense hall times a row of all its racks, a vector."""
     sums = ti.Vector([ti.cast(0.0, hall.real)] * (DENSE_LANES * LANES))
     e = 0
     while e < count:
@@ -151,7 +153,7 @@ def dense_mix(hall: ti.template(), weight_at, source_at, count):
 @ti.func
 @no_type_check
 def sparse_mix(hall: ti.template(), block_at, side):
-    """Exhaust mix before the racks of a block of a sparse hall, by runs of neighbouring racks."""
+    """Return the exhaust mix before the racks of a block of a sparse hall, summed over runs."""
     mix_c = hall.zeros
     source_0 = (EXHAUST_ROW + side) * hall.rack_state.shape[1] // RUN_BLOCKS
     lane = 0
@@ -180,7 +182,7 @@ def sparse_mix(hall: ti.template(), block_at, side):
 @ti.func
 @no_type_check
 def exchange_exhausts(hall: ti.template(), n, block_at, side):
-    """Exhaust mix before the racks of a block from the exhausts on a side, in C."""
+    """Return the exhaust mix before the racks of a block, from the exhausts of ``side``, in C."""
     dc, mix_c = hall.dcs[n], hall.zeros
     is_dense = False
     if ti.static(hall.transient):
@@ -204,7 +206,7 @@ def exchange_exhausts(hall: ti.template(), n, block_at, side):
 @ti.func
 @no_type_check
 def next_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
-    """Exhaust mix before the racks of a block in the present sweep, in C."""
+    """Return the exhaust mix before the racks of a block in the present sweep, in C."""
     block = hall.blocks[block_at]
     mix_c = block.unshifted_mix_c
     if sweep.exchanges_before:
@@ -226,10 +228,10 @@ def store_exhaust(
     outlet_c,
     changes: ti.template(),
 ):
-    """Store what the racks of a block give to the mixes, and how far that has changed.
+    """Store the exhausts of the racks of a block, and the range of their changes.
 
-    Of air that failing fans do not move the mix before the rack is left, so a rack gives the share
-    k of its outlet and 1 - k of its mix.
+    Failing fans move only a share k of the rack's airflow. The rest stays air of the mix before the
+    rack, so the exhaust is k times the outlet plus 1 - k times the mix.
     """
     block = hall.blocks[block_at]
     exhaust_c = mixed_c + block.fan_airflow * (outlet_c - mixed_c)
@@ -248,7 +250,7 @@ def store_exhaust(
 @ti.func
 @no_type_check
 def exchange_dense(hall: ti.template(), n, chunk_at, reference_c):
-    """Exchange the exhausts of a dense hall: mixes of the next sweep, and how far they move."""
+    """Exchange the exhausts of a dense hall: set the mixes of the next sweep and their changes."""
     base_c, least_k, most_k = hall.zeros + reference_c, hall.zeros, hall.zeros
     block_at = hall.chunks[chunk_at].first_block
     while block_at < hall.chunks[chunk_at + 1].first_block:
@@ -265,7 +267,7 @@ def exchange_dense(hall: ti.template(), n, chunk_at, reference_c):
 @ti.func
 @no_type_check
 def dense_mix_of_inputs(hall: ti.template(), n, block_at):
-    """Weights of a block of a dense hall times ``mix_input_k`` of all its racks, in K."""
+    """Return the weights of a block of a dense hall times ``mix_input_k`` of all racks, in K."""
     dc = hall.dcs[n]
     block_0 = hall.chunks[dc.first_chunk].first_block
     n_sources = (dc.racks + (DENSE_LANES - 1)) // DENSE_LANES
@@ -281,9 +283,9 @@ def dense_mix_of_inputs(hall: ti.template(), n, block_at):
 @ti.func
 @no_type_check
 def add_feedback(hall: ti.template(), n, chunk_at):
-    """Move the next mixes of a dense hall on by what comes back from the racks, k/(1 - k) W d.
+    """Add the expected feedback of the racks, k/(1 - k) W d, to the next mixes of a dense hall.
 
-    What comes back is exchanged once and taken as alike from then on.
+    The feedback is exchanged once; later feedback is assumed to have the same distribution.
     """
     dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
     gain = ti.min(dc.feedback_gain, MOST_GAIN_EXPECTED)
@@ -306,10 +308,10 @@ def add_feedback(hall: ti.template(), n, chunk_at):
 @ti.func
 @no_type_check
 def parcel_model(hall: ti.template(), n, chunk_at, servers: ti.template()):
-    """Rates at which the recirculated air before the racks of a chunk follows its mix.
+    """Return the rates at which the recirculated air before the racks of a chunk follows its mix.
 
-    With the time constant of each rack's share of the room air; before racks that take in none, the
-    CRAC air stirs it.
+    The time constant is that of each rack's share of the room air. CRAC air stirs the air before
+    racks that take in none.
     """
     dc = hall.dcs[n]
     parcel_j_per_k = dc.parcel_j_per_k
@@ -342,9 +344,9 @@ def parcel_model(hall: ti.template(), n, chunk_at, servers: ti.template()):
 def advance_parcels(
     hall: ti.template(), n, chunk_at, block_terms_0, sweep: ti.template(), servers: ti.template()
 ):
-    """Recirculated air before the racks of a chunk over a substep, and the heat that warms it.
+    """Advance the recirculated air before the racks of a chunk by a substep; store its heat.
 
-    Air enters a parcel of room air at the mix and leaves at the parcel's temperature,
+    Air enters a parcel of room air at the temperature of the mix and leaves at that of the parcel:
     C_parcel dT/dt = rho*cp*V_captured (T_mix - T).
     """
     parcels = parcel_model(hall, n, chunk_at, servers)
@@ -367,20 +369,20 @@ def advance_parcels(
 @ti.func
 @no_type_check
 def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, moved_k, is_last):
-    """Status of a data center in steady air: DONE where another sweep would move no mix.
+    """Return the status of a data center in steady air: DONE if another sweep moves no mix.
 
-    ``moved_k``: largest change of the supply air of a unit for the next sweep, in K.
+    ``moved_k`` is the largest change of any unit's supply air for the next sweep, in K.
     """
     dc, total = hall.dcs[n], hall.chunks[hall.dcs[n].first_chunk]
     least_k, most_k, shift_k = total.least_change_k, total.most_change_k, dc.shift_k
     left_k = ti.max(most_k - shift_k, shift_k - least_k)
-    # A unit that covers less or more of the need moves the inlets by no more than what the outlets
-    # lie above supply air.
+    # A change of f, the share of the need that a unit covers, moves the inlets by at most the
+    # difference between outlets and supply air.
     above_k = ti.abs(total.outlet_sum_c / ti.cast(dc.racks, ti.f64) - supply_c)
     left_k = ti.max(left_k, most_f_change * above_k)
     left_k = ti.max(left_k, moved_k)
     status = DONE
-    # Written as a negation, a NaN goes on.
+    # With the negation, a NaN counts as not converged.
     if not left_k <= hall.tolerance_k:
         status = RUNNING
         if is_last:
@@ -391,11 +393,11 @@ def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, moved_k,
 @ti.func
 @no_type_check
 def update_shift(hall: ti.template(), n, sweep, has_exchanged, change_k, exchanges):
-    """Common shift of the mixes of a sparse hall in its next sweep.
+    """Update the common shift of the mixes of a sparse hall for its next sweep.
 
-    Most of what is left is the same for all racks and shrinks by the feedback gain each sweep, so
-    the mixes go all the way at once: by the gain of the table, or the one that the last sweep
-    showed; every PLAIN_EVERY sweeps by the sweep's own step alone.
+    Most of the remaining change is the same for all racks and shrinks by the feedback gain in each
+    sweep. The mixes therefore move by the whole expected change at once. The gain comes from the
+    table, or from the last sweep. Every PLAIN_EVERY sweeps, the shift is the plain step.
     """
     dc, shift_k = hall.dcs[n], hall.dcs[n].shift_k
     moved_k = change_k - dc.last_change_k

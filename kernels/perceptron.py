@@ -1,8 +1,8 @@
-"""Multilayer perceptrons over rows of inputs, eight rows as one vector of the processor.
+"""Multilayer perceptrons over rows of inputs; eight rows form one SIMD vector.
 
-A lane is a row, and every sum has the order of its inputs, so that a row has the same bits alone
-and in any batch. Those of a linear-algebra library have not. ``sdc_taichi/learning/policy.py``
-makes the inputs.
+A lane is a row, and every sum follows the order of the inputs. A row therefore has the same bits
+alone and in any batch, which linear-algebra libraries do not guarantee.
+``sdc_taichi/learning/policy.py`` prepares the inputs.
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ from .perceptron_arguments import PERCEPTRON_ARGUMENTS, ROWS, TANH, UNITS
 
 @cache
 def perceptron_kernel() -> Any:
-    """Kernel that computes the outputs of rows; PERCEPTRON_ARGUMENTS are its arguments."""
+    """Return the kernel that computes outputs of rows; PERCEPTRON_ARGUMENTS are its arguments."""
     _, exp_of = log_and_exp("f32", ROWS)
     return define_kernel(
         "perceptron",
@@ -33,7 +33,7 @@ def perceptron_kernel() -> Any:
 @ti.func
 @no_type_check
 def _blocks_of_slice(net: ti.template(), number):
-    """Outputs of the blocks of a slice."""
+    """Compute the outputs of all blocks of a slice."""
     first, end = part_of(number, net.slices, net.blocks)
     layers = net.widths.shape[0] - 1
     low, high = net.zeros - net.clip, net.zeros + net.clip
@@ -59,7 +59,7 @@ def _blocks_of_slice(net: ti.template(), number):
 @ti.func
 @no_type_check
 def _sum_units(net: ti.template(), number, source, ins, at, target):
-    """Biases and weighed inputs of UNITS units, into the work space from ``target`` on."""
+    """Store biases plus weighted inputs of UNITS units in the work space, from ``target`` on."""
     a = net.zeros + net.parameters[at]
     b = net.zeros + net.parameters[at + 1]
     c = net.zeros + net.parameters[at + 2]
@@ -80,7 +80,7 @@ def _sum_units(net: ti.template(), number, source, ins, at, target):
 @ti.func
 @no_type_check
 def _activate_units(net: ti.template(), number, target):
-    """Activation of UNITS units of the work space; tanh x = 1 - 2 / (e^2x + 1)."""
+    """Apply the activation to UNITS units of the work space; tanh x = 1 - 2 / (e^2x + 1)."""
     for i in range(UNITS):
         value = net.work[number, target + i]
         if net.activation == TANH:

@@ -1,16 +1,17 @@
-"""Dynamic programmes of model-predictive control: work that waits, and energy that is stored.
+"""Dynamic programming of model-predictive control: delayed work, and energy stored in batteries.
 
-Both go backwards through the coming steps, over levels of what is carried on, and keep the least
-cost from each level to the end. Between levels costs are read linearly:
+Both programmes go backwards through the steps of the forecast. The state x is the queue or the
+stored energy, on a grid of levels. V(k, x) is the least cost from step k to the end of the
+forecast; between levels it is interpolated linearly:
 
-    V(H, x) <- value of what is left                               end of the forecast
+    V(H, x) <- value of the final queue or stored energy           end of the forecast
     for k = H - 1, ..., 1:  V(k, x) <- min over commands of cost(k, x, command) + V(k + 1, x')
     first command: the candidate with the least cost(0) + V(1, x')
 
-and then forwards, from the first command on, for the energy that the facility will need. With a
-demand charge the programme is done for several peaks: a kWh beyond a peak costs what the charge
-makes of it, and the peak that is dearer than the one of the month to date is charged for.
-``control/mpc.py`` makes the inputs.
+The queue programme then goes forwards from the first command and returns the energy that the
+facility will need. With a demand charge, each programme runs for several trial peaks. Energy beyond
+a trial peak costs the demand charge per kWh, and so does the part of a trial peak that exceeds the
+peak of the month to date. ``control/mpc.py`` prepares the inputs.
 """
 
 from functools import cache
@@ -32,20 +33,20 @@ from .planning_arguments import (
 
 @cache
 def queue_kernel() -> Any:
-    """Kernel that plans the work of each data center; QUEUE_ARGUMENTS are its arguments."""
+    """Return the kernel that plans the work of each data center (QUEUE_ARGUMENTS)."""
     return define_kernel("plan_queues", QUEUE_ARGUMENTS, _queues_of_slice, precision="f64")
 
 
 @cache
 def store_kernel() -> Any:
-    """Kernel that plans the battery of each data center; STORE_ARGUMENTS are its arguments."""
+    """Return the kernel that plans the battery of each data center (STORE_ARGUMENTS)."""
     return define_kernel("plan_stores", STORE_ARGUMENTS, _stores_of_slice, precision="f64")
 
 
 @ti.func
 @no_type_check
 def _cost_between(plan: ti.template(), dc, side, place):
-    """Cost to the end from a place between levels."""
+    """Return the cost to the end of the forecast at ``place``, interpolated between levels."""
     low = ti.max(ti.min(ti.cast(place, ti.i32), plan.levels - 2), 0)
     share = place - low
     return (1.0 - share) * plan.cost[dc, side, low] + share * plan.cost[dc, side, low + 1]
@@ -54,13 +55,13 @@ def _cost_between(plan: ti.template(), dc, side, place):
 @ti.func
 @no_type_check
 def _tried_peak(plan: ti.template(), dc, top_kwh, number):
-    """Peak of the month that is tried, in kWh of a step."""
+    """Return trial peak ``number`` of the month, in kWh per step."""
     peak = ti.cast(NO_PEAK_KWH, ti.f64)
     if plan.peaks > 1:
-        own = plan.dcs[dc].peak_kwh
-        lowest = ti.max(own, LOWEST_PEAK_SHARE * top_kwh)
+        peak_to_date_kwh = plan.dcs[dc].peak_kwh
+        lowest = ti.max(peak_to_date_kwh, LOWEST_PEAK_SHARE * top_kwh)
         top = ti.max(top_kwh, lowest)
-        # Closer to each other near the top, from which work and batteries take little.
+        # Space the trial peaks more closely near the top: work and batteries lower a peak little.
         below = ti.cast(plan.peaks - 1 - number, ti.f64) / (plan.peaks - 1)
         peak = top - (top - lowest) * below * below
     return peak
@@ -69,14 +70,14 @@ def _tried_peak(plan: ti.template(), dc, top_kwh, number):
 @ti.func
 @no_type_check
 def _energy_cost(plan: ti.template(), dc, weight, kwh, peak_kwh):
-    """Cost of the energy of a step, with that of exceeding the peak that is tried."""
+    """Return the cost of the energy of a step, including the energy beyond the trial peak."""
     return weight * kwh + plan.dcs[dc].peak_cost * ti.max(kwh - peak_kwh, 0.0)
 
 
 @ti.func
 @no_type_check
 def _charge_for_peak(plan: ti.template(), dc, peak_kwh):
-    """Cost of a peak beyond the one of the month to date."""
+    """Return the demand charge for the part of a peak above the peak of the month to date."""
     cost = ti.cast(0.0, ti.f64)
     if plan.peaks > 1:
         cost = plan.dcs[dc].peak_cost * ti.max(peak_kwh - plan.dcs[dc].peak_kwh, 0.0)
@@ -100,15 +101,15 @@ def _queues_of_slice(plan: ti.template(), number):
             peak_kwh = _tried_peak(plan, dc, top_kwh, number_of_peak)
             _plan_queue(plan, dc, peak_kwh)
             _read_map(plan, dc, 0)
-            found = _charge_for_peak(plan, dc, peak_kwh)
+            charge = _charge_for_peak(plan, dc, peak_kwh)
             least = ti.cast(ti.math.inf, ti.f64)
             at = 0
             for c in range(plan.first_executed.shape[1]):
                 cost = _first_queue_cost(plan, dc, c, peak_kwh)
                 if c == 0 or cost < least - NEGLIGIBLE_SHARE * ti.abs(least):
                     least, at = cost, c
-            if number_of_peak == 0 or found + least < best:
-                best, best_peak = found + least, peak_kwh
+            if number_of_peak == 0 or charge + least < best:
+                best, best_peak = charge + least, peak_kwh
                 plan.chosen[dc] = at
         if plan.peaks > 1:
             _plan_queue(plan, dc, best_peak)
@@ -118,7 +119,7 @@ def _queues_of_slice(plan: ti.template(), number):
 @ti.func
 @no_type_check
 def _first_queue_cost(plan: ti.template(), dc, c, peak_kwh):
-    """Cost of a candidate of the first step, and of what follows."""
+    """Return the cost of candidate ``c`` of the first step, including all later steps."""
     of_dc = plan.dcs[dc]
     kwh = _kwh_of(plan, dc, plan.first_executed[dc, c])
     now = _energy_cost(plan, dc, plan.steps[dc * plan.horizon].weight, kwh, peak_kwh)
@@ -130,7 +131,7 @@ def _first_queue_cost(plan: ti.template(), dc, c, peak_kwh):
 @ti.func
 @no_type_check
 def _plan_queue(plan: ti.template(), dc, peak_kwh):
-    """Least cost from each level and step on, V(1) being in side 1 of the work space."""
+    """Compute the least cost from each level and step on; side 1 of ``cost`` then holds V(1)."""
     of_dc = plan.dcs[dc]
     _read_map(plan, dc, plan.horizon - 1)
     slope = _kwh_of(plan, dc, of_dc.mean_tasks + SECANT_TASKS)
@@ -164,7 +165,7 @@ def _plan_queue(plan: ti.template(), dc, peak_kwh):
 @ti.func
 @no_type_check
 def _follow_queue(plan: ti.template(), dc):
-    """Energy of the facility in each step under the commands that were found."""
+    """Store the energy of the facility in each step under the planned commands."""
     chosen = plan.chosen[dc]
     waiting = plan.first_waiting[dc, chosen]
     _read_map(plan, dc, 0)
@@ -182,7 +183,7 @@ def _follow_queue(plan: ti.template(), dc):
 @ti.func
 @no_type_check
 def _work_step(plan: ti.template(), dc, at, command, waiting):
-    """Work that a step does, leaves waiting, and is late with or drops, in tasks."""
+    """Return the tasks that a step executes, leaves waiting, and delays too long or drops."""
     step = plan.steps[at]
     due = ti.max(waiting - step.not_due, 0.0)
     forced = ti.min(due, step.most_due)
@@ -199,7 +200,7 @@ def _work_step(plan: ti.template(), dc, at, command, waiting):
 @ti.func
 @no_type_check
 def _kwh_of(plan: ti.template(), dc, executed):
-    """Energy of the facility of a step that does some work, from the energies of its map."""
+    """Return the facility energy of a step for its executed work, interpolated in the map."""
     last = plan.kwh.shape[1] - 1
     place = ti.max(executed, 0.0) * 0.01 * last
     low = ti.min(ti.cast(place, ti.i32), last - 1)
@@ -210,7 +211,7 @@ def _kwh_of(plan: ti.template(), dc, executed):
 @ti.func
 @no_type_check
 def _read_map(plan: ti.template(), dc, k):
-    """Energy of step ``k`` at each utilisation of the map, into the work space."""
+    """Store the facility energy of step ``k`` at each utilisation of the map in ``plan.kwh``."""
     of_dc, step = plan.dcs[dc], plan.steps[dc * plan.horizon + k]
     number = ti.cast(of_dc.map, ti.i32)
     w, lead = _node(step.weather, plan.table.shape[1])
@@ -233,7 +234,7 @@ def _read_map(plan: ti.template(), dc, k):
 @ti.func
 @no_type_check
 def _node(place, count):
-    """Node below a place, and the share of the next node."""
+    """Return the grid node below ``place``, and the interpolation weight of the next node."""
     low = ti.max(ti.min(ti.cast(place, ti.i32), count - 2), 0)
     return low, place - low
 
@@ -241,7 +242,7 @@ def _node(place, count):
 @ti.func
 @no_type_check
 def _stores_of_slice(plan: ti.template(), number):
-    """Plan the batteries of a slice."""
+    """Plan the batteries of the data centers of a slice."""
     first, end = part_of(number, plan.slices, plan.size)
     for dc in range(first, end):
         top_kwh = ti.cast(0.0, ti.f64)
@@ -265,7 +266,7 @@ def _stores_of_slice(plan: ti.template(), number):
 @ti.func
 @no_type_check
 def _plan_store(plan: ti.template(), dc, peak_kwh):
-    """Least cost from each level and step on, V(1) being in side 1 of the work space."""
+    """Compute the least cost from each level and step on; side 1 of ``cost`` then holds V(1)."""
     of_dc = plan.dcs[dc]
     side = plan.horizon % 2
     for level in range(plan.levels):
@@ -292,9 +293,10 @@ def _plan_store(plan: ti.template(), dc, peak_kwh):
 @ti.func
 @no_type_check
 def _battery_step(plan: ti.template(), dc, level, command, load_kwh, peak_kwh):
-    """Energy that a battery draws and delivers, in kWh, to keep to the grid connection and a peak.
+    """Return the energy that a battery draws and delivers in a step, in kWh.
 
-    No share of the full power would follow the load down to a peak.
+    The battery also keeps the facility within the grid connection and the trial peak. Commands are
+    shares of full power, and no fixed share would follow the load down to a peak.
     """
     limit_kwh = ti.min(plan.dcs[dc].grid_limit, peak_kwh)
     most = ti.min(plan.most_discharge[dc, level], plan.load_share[dc, level] * load_kwh)

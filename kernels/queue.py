@@ -1,4 +1,4 @@
-"""The queue of delay-tolerant work at the end of a step, see ``sim/queue.py``."""
+"""Kernel that updates the queue of delay-tolerant work at the end of a step (``sim/queue.py``)."""
 
 from functools import cache
 from typing import Any, no_type_check
@@ -9,34 +9,35 @@ from .compiler.arrays import F64_LANES
 from .compiler.functions import SLICE
 
 TASK_BLOCKS = 32
-"""Vectors side by side in a row that one task takes on."""
+"""Number of adjacent vectors of a row that one task processes."""
 TASK_ROWS = 8
-"""Rows that a task goes through at a time; twice as many compete for the same sets of the cache."""
+"""Rows that a task processes together; twice as many compete for the same sets of the cache."""
 SERIAL_UP_TO = 512
-"""Data centers that one thread computes sooner than several are woken."""
+"""Largest number of data centers that one thread computes faster than several."""
 
 
 @cache
 def queue_kernel() -> Any:
-    """Kernel that takes work out of the queue, puts new work in, and reads the ages.
+    """Return the kernel that removes and adds work of the queue, and measures the age of the work.
 
-    Row k of a queue is the work still queued that was put in by the end of step k, oldest first, in
-    L rows. A task goes through TASK_ROWS rows of TASK_BLOCKS vectors at a time, as they lie in
-    memory; the oldest rows that are known to be 0 are not read.
+    Row k of a queue is the waiting part of the work added by the end of step k, oldest first, in L
+    rows. A task processes TASK_ROWS rows of TASK_BLOCKS vectors together, in memory order. It does
+    not read the oldest rows that are known to be 0.
 
-    Arguments, all arrays but the first four being ``compiler.arrays.vector_rows`` of data centers:
+    Arguments. All but the first four are arrays with the layout of
+    ``compiler.arrays.vector_rows``, with data centers as entries:
 
-    - serial: whether the calling thread does all.
-    - one: 1, see "Loops of step 1" in README.md.
-    - negligible: work up to this is round-off, and has no age.
+    - serial: True if the calling thread does all work.
+    - one: always 1, see "Loops of step 1" in README.md.
+    - negligible: largest amount of work that counts as rounding error and has no age.
     - due_row: row of the queue that is due when the next step starts, L for none, (vectors, lanes).
-    - empty_rows: how many of the oldest rows of a vector will be 0 after the step; read and kept up
-      to date, (vectors,).
+    - empty_rows: number of the oldest rows of a vector that are 0 after the step, input and output,
+      (vectors,).
     - before: queues before the step, (L, vectors).
-    - moved: work taken out, and work put in, (2, vectors).
-    - after: queues after the step, (L, vectors).
-    - found: work that waits, work that will be due, age of the oldest work and mean age in steps,
-      (4, vectors).
+    - moved: work removed, and work added, (2, vectors).
+    - after: output, queues after the step, (L, vectors).
+    - statistics: output, (4, vectors): waiting work, work that will be due, age of the oldest work
+      in steps, and mean age in steps.
     """
     blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
     ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
@@ -53,7 +54,7 @@ def queue_kernel() -> Any:
         before: blocks,
         moved: blocks,
         after: blocks,
-        found: blocks,
+        statistics: blocks,
     ):
         n_tasks = (before.shape[1] + (TASK_BLOCKS - 1)) // TASK_BLOCKS
         ti.loop_config(serialize=serial)
@@ -67,17 +68,17 @@ def queue_kernel() -> Any:
                 limit = zeros + negligible
                 block = first
                 while block < end:
-                    found[0, block] = zeros
-                    found[2, block] = zeros
-                    found[3, block] = zeros
+                    statistics[0, block] = zeros
+                    statistics[2, block] = zeros
+                    statistics[3, block] = zeros
                     block += one
                 row = 0
                 while row < last:
                     row_end = ti.min(row + TASK_ROWS, last)
                     block = first
                     while block < end:
-                        out, filled = moved[0, block], found[0, block]
-                        aged, waited = found[2, block], found[3, block]
+                        out, filled = moved[0, block], statistics[0, block]
+                        aged, waited = statistics[2, block], statistics[3, block]
                         k, zero_end = row, ti.min(empty_rows[block], row_end)
                         while k < zero_end:
                             after[k, block] = zeros
@@ -93,15 +94,15 @@ def queue_kernel() -> Any:
                             aged += ti.select(waits, ones, zeros)
                             waited += ti.select(waits, left, zeros)
                             k += one
-                        found[0, block] = filled
-                        found[2, block] = aged
-                        found[3, block] = waited
+                        statistics[0, block] = filled
+                        statistics[2, block] = aged
+                        statistics[3, block] = waited
                         block += one
                     row = row_end
                 block = first
                 while block < end:
-                    # A row of 0 in all lanes is the one before it a step later.
-                    filled, most = found[0, block], ti.f64(0.0)
+                    # A row that is 0 in all lanes moves to the previous row in each step.
+                    filled, most = statistics[0, block], ti.f64(0.0)
                     for i in range(F64_LANES):
                         most = ti.max(most, filled[i])
                     empty_rows[block] = ti.max(last - 1 - ti.cast(most, ti.i32), 0)
@@ -113,10 +114,10 @@ def queue_kernel() -> Any:
                             due_of = after[due_row[block, i], block]
                             due[i] = due_of[i]
                     some = total > zeros
-                    mean = found[3, block] / ti.select(some, total, ones)
-                    found[0, block] = total
-                    found[1, block] = due
-                    found[3, block] = ti.select(some, mean, zeros)
+                    mean = statistics[3, block] / ti.select(some, total, ones)
+                    statistics[0, block] = total
+                    statistics[1, block] = due
+                    statistics[3, block] = ti.select(some, mean, zeros)
                     block += one
 
     return queue_after

@@ -1,4 +1,4 @@
-"""Racks of a block in one sweep: from the air before them to their rows and sums."""
+"""Racks of a block in one sweep: from their intake air to rack results and sums."""
 
 from typing import no_type_check
 
@@ -44,7 +44,7 @@ def compute_groups(
     sums: ti.template(),
     extremes: ti.template(),
 ):
-    """Add the groups of a block to the sums of their racks; return the heat servers store, in W."""
+    """Add the groups of a block to the sums of their racks; return heat stored in servers, in W."""
     block, thermal_storage_w = hall.blocks[block_at], hall.zeros
     z, n_groups, first_row, first_place = 0, block.groups, block.first_row, block.first_place
     while z < n_groups:
@@ -83,7 +83,7 @@ def compute_block(
     hottest: ti.template(),
     changes: ti.template(),
 ):
-    """Compute the racks of a block in a sweep: their rows, and the lanes of the chunk's TERMS."""
+    """Compute the racks of a block in a sweep: rack results, and the TERMS of their chunk."""
     block, terms = hall.blocks[block_at], hall.terms[terms_at]
     block_terms = hall.block_terms[block_terms_at]
     mixed_c, parcel_w = hall.zeros, hall.zeros
@@ -103,7 +103,7 @@ def compute_block(
     fresh_m3s = apply_rack_factors(hall, sums, racks, air)
     flow_m3s, mean_c = sums.flow_m3s, sums.inlet_c
 
-    # The exact mean: heat stored plus heat removed is heat generated.
+    # This mean outlet is exact: stored heat plus removed heat equals generated heat.
     heat_w = sums.cpu_w + sums.fan_w - thermal_storage_w
     outlet_m3k_s = sums.inlet_m3k_s + heat_w * servers.per_air
     per_flow = hall.real(1.0) / larger(flow_m3s, hall.zeros + hall.real(1e-30))
@@ -120,18 +120,18 @@ def compute_block(
         mean_c = ti.select(flow_m3s > hall.real(0.0), sums.inlet_m3k_s * per_flow, mean_c)
         captured_m3s = flow_m3s - air.cover * fresh_m3s
         return_m3k_s = outlet_m3k_s - captured_m3s * air.mixed_c - parcel_w * servers.per_air
-        # `x = x + y`, since `x += y` would be atomic.
+        # This is `x = x + y`, because `x += y` would be an atomic operation.
         terms.return_m3k_s = terms.return_m3k_s + return_m3k_s
         block.captured_m3s = captured_m3s
         block_terms.fresh_m3s = fresh_m3s
-        given_c = outlet_c
+        exhaust_c = outlet_c
         if ti.static(hall.transient):
-            # Past a rack that is off flows air of its inlet, but for the draught.
+            # Air at inlet temperature passes a rack that is off, except for a small draught.
             draught_c = mean_c + hall.real(STILL_AIR_SHARE) * (outlet_c - mean_c)
-            given_c = ti.select(racks.powered > hall.real(0.0), outlet_c, draught_c)
-        store_exhaust(hall, block_at, sweep, air.mixed_c, given_c, changes)
+            exhaust_c = ti.select(racks.powered > hall.real(0.0), outlet_c, draught_c)
+        store_exhaust(hall, block_at, sweep, air.mixed_c, exhaust_c, changes)
     else:
-        # SHI and RHI are those of the racks, by whatever model their outlets are.
+        # SHI and RHI are computed from rack outlets, with the outlet model of the hall.
         sums.inlet_m3k_s = flow_m3s * mean_c
         outlet_m3k_s = flow_m3s * outlet_c
     terms.inlet_m3k_s = terms.inlet_m3k_s + sums.inlet_m3k_s
@@ -160,12 +160,12 @@ def compute_block(
 @ti.func
 @no_type_check
 def no_extremes(hall: ti.template()):
-    """Coolest and hottest inlet and hottest outlet of each rack, before the first of its groups."""
+    """Return initial extremes of each rack: coolest and hottest inlet, and hottest outlet."""
     return ti.Struct(
         inlet_min_c=hall.zeros + hall.real(1e30),
         inlet_max_c=hall.zeros - hall.real(1e30),
         outlet_max_c=hall.zeros - hall.real(1e30),
-        # The group with the hottest inlet.
+        # Group of the rack with the hottest inlet.
         hottest_group=hall.zeros,
     )
 
@@ -173,9 +173,9 @@ def no_extremes(hall: ti.template()):
 @ti.func
 @no_type_check
 def update_extremes(hall: ti.template(), extremes: ti.template(), z, inlet_c, outlet_c):
-    """Extremes of each rack with those of its group z.
+    """Update the extremes of each rack with its group z.
 
-    Groups without servers repeat another group of their rack, and so change nothing.
+    A group without servers repeats another group of its rack, so it does not change the extremes.
     """
     extremes.inlet_min_c = smaller(inlet_c, extremes.inlet_min_c)
     is_hotter = inlet_c > extremes.inlet_max_c
@@ -187,7 +187,7 @@ def update_extremes(hall: ti.template(), extremes: ti.template(), z, inlet_c, ou
 @ti.func
 @no_type_check
 def no_hottest(hall: ti.template()):
-    """Hottest inlet of each lane of a chunk, before the first of its blocks."""
+    """Return the initial struct of the hottest inlet in each lane of a chunk."""
     return ti.Struct(
         inlet_c=hall.zeros - hall.real(1e30), block=ti.Vector([0] * LANES), group=hall.zeros
     )
@@ -202,7 +202,7 @@ def update_hottest(
     extremes: ti.template(),
     hottest: ti.template(),
 ):
-    """Hottest inlet of each rack of a block in C, also to the hottest of each lane of the chunk."""
+    """Return the hottest inlet of each rack of a block, in C; update the hottest of each lane."""
     is_rack = racks.per_server > hall.real(0.0)
     inlet_c = ti.select(is_rack, extremes.inlet_max_c, hall.zeros - hall.real(1e30))
     is_hotter = rank(hall, inlet_c) > rank(hall, hottest.inlet_c)
@@ -222,11 +222,11 @@ def add_degrees_out_of_range(
     air: ti.template(),
     extremes: ti.template(),
 ):
-    """Add what the inlets of a block lie beyond the recommended range by, which few ever leave."""
+    """Add the degrees by which inlets of a block are outside the recommended range, a rare case."""
     low_c, high_c = hall.real(RECOMMENDED_C[0]), hall.real(RECOMMENDED_C[1])
     beyond_k = larger(extremes.inlet_max_c - high_c, low_c - extremes.inlet_min_c)
     beyond_k *= racks.per_server
-    # Written like this, the compiler asks all lanes at once.
+    # In this form the compiler tests all lanes at once.
     is_any = 0
     for i in ti.static(range(LANES)):
         is_any |= ti.cast(beyond_k[i] > hall.real(0.0), ti.i32)
@@ -246,9 +246,9 @@ def add_degrees_out_of_range(
 @ti.func
 @no_type_check
 def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti.template()):
-    """Results of the racks of a block: of the last sweep, or means over the substeps.
+    """Store the results of the racks of a block: of the last sweep, or means over the substeps.
 
-    The hottest inlet and outlet are the highest of any substep.
+    The hottest inlet and outlet are maxima over the substeps.
     """
     block = hall.blocks[block_at]
     if ti.static(hall.transient):

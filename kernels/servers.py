@@ -1,11 +1,12 @@
-"""Servers of a block of racks: the air that they take in, what they draw, and what leaves them.
+"""Servers of a block of racks: intake air, power, airflow, and outlet air.
 
-Curves of a server with inlet T, at most the curve limit, and utilisation u (Sun et al. 2021;
-EnergyPlus ElectricEquipment:ITE:AirCooled): power without fans max(idle, full (slope T + offset +
-shift u)), airflow ratio y = clip(slope T + offset + shift u), fan power
-reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has them in NumPy. Fans
-move the volume y; airflows are volumes at a reference temperature, so y is taken times the density
-at the inlet over that at the reference (``sdc_taichi/plant/air.py``).
+A server has these curves of inlet T (at most the curve limit) and utilisation u (Sun et al. 2021;
+EnergyPlus ElectricEquipment:ITE:AirCooled). Power without fans is max(idle, full (slope T + offset
++ shift u)). The airflow ratio is y = clip(slope T + offset + shift u). Fan power is
+reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has the same curves in
+NumPy. Fans move the volume y at inlet density, but airflows are volumes at a reference
+temperature. The airflow is therefore y times the density at the inlet divided by that at the
+reference (``sdc_taichi/plant/air.py``).
 """
 
 from typing import NamedTuple, no_type_check
@@ -18,23 +19,24 @@ from .hall_arguments import LANES, LOADS_PER_GROUP, LOADS_PER_RACK, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 STILL_AIR_SHARE = 0.02
-"""Share of its airflow at full fan speed by which a rack whose servers are off loses heat, in
-transient halls: draught of warm air and the surface of the rack, see docs/transients.md."""
+"""Airflow that cools a rack with all servers off in transient halls, as a share of its airflow at
+full fan speed. It stands for the draught of warm air and the surface of the rack; see
+docs/transients.md."""
 
 
 class _ReleasedOutlet(NamedTuple):
-    """Rack outlet fit of the released SustainDC, see ``rack_outlet``."""
+    """Constants of the rack outlet fit of the released SustainDC, used in ``rack_outlet``."""
 
     factor: float = 1.918
-    """Factor of the rise, dimensionless."""
+    """Factor of the temperature rise, dimensionless."""
     power_excess: float = 1.096 - 1.0
-    """Exponent of power less 1."""
+    """Exponent of power minus 1."""
     divisor: float = 0.526
-    """Divisor of the rise, dimensionless."""
+    """Divisor of the temperature rise, dimensionless."""
     flow_excess: float = 0.824 - 1.0
-    """Exponent of airflow less 1."""
+    """Exponent of airflow minus 1."""
     offset_k: float = -14.01
-    """Constant added to the rise, in K."""
+    """Constant added to the temperature rise, in K."""
 
 
 RELEASED_OUTLET = _ReleasedOutlet()
@@ -43,12 +45,12 @@ RELEASED_OUTLET = _ReleasedOutlet()
 @ti.func
 @no_type_check
 def server_model(hall: ti.template(), n):
-    """Curves and coefficients that all servers of a data center have in common."""
+    """Return the curves and coefficients that all servers of a data center share."""
     dc = hall.dcs[n]
     per_reference = hall.real(1.0) / dc.fan_reference_ratio
     exponent = dc.fan_exponent
-    # Branches on data, not one kernel per exponent: compiled apart, they would round apart, and
-    # a data center must not depend on its batch.
+    # These are branches on data, not one kernel per exponent: separately compiled kernels would
+    # round differently, and the results of a data center must not depend on its batch.
     at_full = per_reference
     if exponent == hall.real(3.0):
         at_full = per_reference * per_reference * per_reference
@@ -71,7 +73,7 @@ def server_model(hall: ti.template(), n):
         curve_limit_c=hall.zeros + dc.curve_limit_c,
         air_j_per_m3_k=air_j_per_m3_k,
         per_air=hall.real(1.0) / air_j_per_m3_k,
-        # Heat that the air takes up per airflow and difference of server and inlet temperature.
+        # Heat that the air takes up per airflow and K of server minus inlet temperature.
         uptake_j_per_m3_k=dc.effectiveness * air_j_per_m3_k,
     )
 
@@ -79,7 +81,7 @@ def server_model(hall: ti.template(), n):
 @ti.func
 @no_type_check
 def first_share_at(hall: ti.template(), n, block_at):
-    """First entry in unit_shares of a block of racks; the units of its hall follow."""
+    """Return the index in unit_shares of a block's first CRAC unit; the other units follow."""
     dc = hall.dcs[n]
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
     block_0 = hall.chunks[dc.first_chunk].first_block
@@ -89,11 +91,11 @@ def first_share_at(hall: ti.template(), n, block_at):
 @ti.func
 @no_type_check
 def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
-    """Air that the racks of a block take in, from the exhaust mix before them, in C.
+    """Return the intake air of the racks of a block, from the exhaust mix before them in C.
 
-    ``approach``: supply air plus the rack's approach temperature. ``recirculation``:
-    T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix); ``fresh_ratio`` is the row of the
-    units that holds f.
+    With inlet model ``approach`` it is supply air plus the rack's approach temperature. With
+    ``recirculation`` it is T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix).
+    ``fresh_ratio`` is the row of the units that contains f.
     """
     block, dc = hall.blocks[block_at], hall.dcs[n]
     unit_0 = dc.first_unit
@@ -118,7 +120,7 @@ def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
         exhaust_share=exhaust_share,
         # sum_k s_jk f_k (T_sup,k - T_mix).
         fresh_k=fresh_k,
-        # Inlet of a server that takes in no exhaust; height warms it by as much for each g.
+        # Inlet of a server without exhaust intake; per_height_k is the change per height factor g.
         least_c=mixed_c + fresh_k,
         per_height_k=exhaust_share * fresh_k,
     )
@@ -127,7 +129,7 @@ def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
 @ti.func
 @no_type_check
 def rack_model(hall: ti.template(), servers: ti.template(), block_at):
-    """Load of the racks of a block, and factors that all servers of a rack have in common."""
+    """Return the load of the racks of a block, and the factors that servers of a rack share."""
     block, u = hall.blocks[block_at], servers.utilisation
     if hall.load_level == LOADS_PER_RACK:
         u = block.load
@@ -146,19 +148,19 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
     if ti.static(hall.transient):
         off = hall.real(1.0) - powered
         available_airflow = blown_airflow + hall.real(STILL_AIR_SHARE) * off
-        # Draught is a share of the airflow at full speed, whatever inlet and load are.
+        # The draught is a share of the airflow at full speed, for any inlet and load.
         fan_low = ti.select(powered > hall.real(0.0), fan_low, hall.zeros + hall.real(1.0))
     return ti.Struct(
-        # A group does u + deviation*u*(1 - u), which conserves the work of its rack and stays
-        # within 0..1.
+        # A group has the utilisation u + deviation*u*(1 - u): it keeps the total work of the rack
+        # and stays within 0..1.
         deviation_scale=u * (hall.real(1.0) - u),
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
-        # Places of the first and last group in group_load, where loads are given per group.
+        # Indices of the first and last group in group_load, if loads are given per group.
         first_group=first_group,
         last_group=last_group,
-        # Factors of sums over the groups, see apply_rack_factors.
+        # Factors for sums over the groups, see apply_rack_factors.
         powered=powered,
         available_airflow=available_airflow,
         full_m3s=available_airflow * servers.full_m3s,
@@ -170,7 +172,7 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
 @ti.func
 @no_type_check
 def group_inlet(hall: ti.template(), air: ti.template(), group):
-    """Inlet of a group of each rack of a block, in C."""
+    """Return the inlet of one group in each rack of a block, in C."""
     inlet_c = air.least_c + group.inlet_offset_k
     if ti.static(hall.recirculates):
         inlet_c = air.least_c - group.height_factor * air.per_height_k
@@ -187,18 +189,18 @@ def compute_group(
     group,
     z,
 ):
-    """Inlet in C, power without fans in W, and airflow and fan power ratios of a server.
+    """Return inlet (C), power without fans (W), and airflow and fan power ratios of a server.
 
-    Of group z of each rack of a block; ratios are to the full airflow and full fan power of the
-    data center. Powers and airflows are those of a rack that is on for the whole step and whose
-    fans are in order.
+    The server belongs to group z in each rack of a block. Ratios are relative to the full airflow
+    and full fan power of the data center. Power and airflow assume that the rack is on for the
+    whole step and that its fans work.
     """
     inlet_c = group_inlet(hall, air, group)
-    # Utilisation over that of the rack, or utilisation itself where given per group.
+    # Utilisation minus that of the rack, or utilisation itself if given per group.
     deviation = group.load_deviation * racks.deviation_scale
     if hall.load_level == LOADS_PER_GROUP:
         for i in range(LANES):
-            # Where a rack has no group z, its last group once more.
+            # A rack without group z repeats its last group.
             at = ti.min(racks.first_group[i] + z, racks.last_group[i])
             deviation[i] = hall.group_load[at]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
@@ -210,7 +212,7 @@ def compute_group(
     if servers.fan_exponent == hall.real(3.0):
         fan_power = airflow * airflow * airflow
     elif servers.fan_exponent != hall.real(1.0):
-        # x^p as x exp((p - 1) log x), which is 0 where x is.
+        # Compute x^p as x exp((p - 1) log x), which is 0 for x = 0.
         excess = servers.fan_exponent - hall.real(1.0)
         fan_power = airflow * hall.exp_of(hall.log_of(airflow) * excess)
     airflow *= group.full_airflow - on_curve_c * group.airflow_fall_per_k
@@ -221,16 +223,16 @@ def compute_group(
 @ti.func
 @no_type_check
 def outlet_model(hall: ti.template(), n, servers: ti.template(), racks: ti.template()):
-    """Factors of ``group_outlet`` that all servers of a rack have in common."""
+    """Return the factors of ``group_outlet`` that all servers of a rack share."""
     per_k = hall.real(1.0) / larger(
         racks.full_m3s * servers.air_j_per_m3_k, hall.zeros + hall.real(1e-30)
     )
     is_blown = racks.full_m3s > hall.real(0.0)
     return ti.Struct(
-        # Rise at full airflow per W of power without fans, and at full fan power.
+        # Temperature rise at full airflow: per W of power without fans, and at full fan power.
         cpu_k_per_w=racks.powered * per_k,
         fan_k=racks.full_fan_w * per_k,
-        # Share of server over inlet temperature that the air takes up.
+        # Share of server minus inlet temperature that the air takes up.
         uptake=ti.select(is_blown, hall.zeros + hall.dcs[n].effectiveness, hall.zeros),
     )
 
@@ -246,12 +248,13 @@ def group_outlet(
     fan_power,
     server_c,
 ):
-    """Outlet of a server of each rack of a block in C, from the values of ``compute_group``.
+    """Return the outlet of a server in each rack of a block, in C, from ``compute_group``'s values.
 
-    T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with the server's own
-    temperature T_s. One division, where ``layers.py`` divides by the airflow itself.
+    The outlet is T + P/(rho*cp*V). In transient halls it is
+    T + eps (T_s - T) + P_fan/(rho*cp*V), with the server temperature T_s. This function needs one
+    division, whereas ``layers.py`` divides by the airflow itself.
     """
-    # Where the curve gives no airflow, the outlet is out of reach, but a number.
+    # If the curve gives no airflow, the outlet is very large but finite.
     some_airflow = airflow + hall.real(1e-30)
     outlet_c = inlet_c
     if ti.static(hall.transient):
@@ -265,7 +268,7 @@ def group_outlet(
 @ti.func
 @no_type_check
 def zero_rack_sums(hall: ti.template()):
-    """Sums over the groups of each rack of a block, before the first group."""
+    """Return zero sums over the groups of each rack of a block."""
     return ti.Struct(
         cpu_w=hall.zeros,
         fan_w=hall.zeros,
@@ -281,7 +284,7 @@ def zero_rack_sums(hall: ti.template()):
 def add_group(
     hall: ti.template(), sums: ti.template(), group, count, inlet_c, cpu_w, airflow, fan_power
 ):
-    """Add ``count`` servers of a group to the sums of their racks, still without rack factors."""
+    """Add ``count`` servers of a group to the sums of their racks, without rack factors."""
     counted = count * airflow
     sums.cpu_w += count * cpu_w
     sums.fan_w += count * fan_power
@@ -298,9 +301,9 @@ def add_group(
 def apply_rack_factors(
     hall: ti.template(), sums: ti.template(), racks: ti.template(), air: ti.template()
 ):
-    """Turn the sums into W, m3/s and m3 K/s; return the need of the racks for supply air, m3/s.
+    """Convert the sums to W, m3/s and m3 K/s; return the racks' need for supply air, in m3/s.
 
-    The need is what the servers would take in of supply air if the CRAC units covered all of it,
+    The need is the supply air that the servers would take in if the CRAC units covered all of it,
     (1 - r_j) V_j.
     """
     sums.cpu_w *= racks.powered
@@ -319,11 +322,11 @@ def apply_rack_factors(
 @ti.func
 @no_type_check
 def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template(), per_flow):
-    """Outlet of racks by the models that know racks alone (inlet model approach), in C.
+    """Return the outlet of racks in C, by outlet models of whole racks (inlet model approach).
 
-    ``rack``: T + P/(rho*cp*V). ``released``: the fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) -
-    14.01 of the released SustainDC. P^1.096 / V^0.824 is P/V exp(0.096 log P + 0.176 log V), whose
-    exponential is of small numbers and loses no digits.
+    Model ``rack`` is T + P/(rho*cp*V). Model ``released`` is the fit of the released SustainDC,
+    T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01. The term P^1.096 / V^0.824 is computed as
+    P/V exp(0.096 log P + 0.176 log V), because the exponential of small numbers loses no digits.
     """
     power_w = sums.cpu_w + sums.fan_w
     outlet_c = sums.inlet_c + power_w * per_flow * servers.per_air
@@ -340,10 +343,10 @@ def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template()
 @ti.func
 @no_type_check
 def warming_model(hall: ti.template(), n, servers: ti.template()):
-    """How the servers of a data center warm in a substep: C dT/dt = P - eps K (T - T_in).
+    """Return the coefficients of server warming in a substep, C dT/dt = P - eps K (T - T_in).
 
-    C is the heat capacity of a server, K = rho*cp*V that of its air, eps how much of the difference
-    the air takes up. Solved by the exact exponential, T(t) - T(0) = phi1(x) (P/C t - x (T(0) -
+    C is the heat capacity of a server, K = rho*cp*V that of its airflow, and eps the share of
+    T - T_in that the air takes up. The solution is exact: T(t) - T(0) = phi1(x) (P/C t - x (T(0) -
     T_in)) with x = eps K t / C.
     """
     dc, step_s = hall.dcs[n], ti.cast(hall.substep_s, hall.real)
@@ -358,7 +361,7 @@ def warming_model(hall: ti.template(), n, servers: ti.template()):
     return ti.Struct(
         halvings=halvings,
         k_per_w=k_per_w,
-        # x of a server at full airflow.
+        # Value of x for a server at full airflow.
         per_airflow=servers.full_m3s * servers.uptake_j_per_m3_k * k_per_w,
         w_per_k=server_j_per_k * (hall.real(1.0) / step_s),
     )
@@ -376,9 +379,9 @@ def warm_servers(
     cpu_w,
     airflow,
 ):
-    """Warm the servers of a group by a substep; return the change of their temperature, in K."""
+    """Advance the server temperatures of a group by a substep; return their change, in K."""
     before_c = hall.server_c[at]
-    # Without air a server keeps all of its power.
+    # Without airflow (x = 0) a server stores all of its power as heat.
     per_capacity = hall.real(1.0) / capacity
     x = airflow * (racks.available_airflow * warming.per_airflow) * per_capacity
     change_k = cpu_w * (racks.powered * warming.k_per_w) * per_capacity - (before_c - inlet_c) * x
@@ -390,14 +393,14 @@ def warm_servers(
 @ti.func
 @no_type_check
 def group_at(hall: ti.template(), place, z):
-    """Group z of the rack at a place; where it has fewer, its last group once more."""
+    """Return the index of group z of the rack at a place, or of the last group if it has fewer."""
     return ti.min(hall.places[place].first_group + z, hall.places[place + 1].first_group - 1)
 
 
 @ti.func
 @no_type_check
 def load_server_temperatures(hall: ti.template(), block_at):
-    """Temperatures of the servers of a block at the start of the step, to server_c."""
+    """Load the server temperatures of a block at the start of the step into server_c."""
     block = hall.blocks[block_at]
     for z in range(block.groups):
         before_c = hall.zeros
@@ -409,7 +412,7 @@ def load_server_temperatures(hall: ti.template(), block_at):
 @ti.func
 @no_type_check
 def store_server_temperatures(hall: ti.template(), block_at, z, count, after_c):
-    """Temperatures of the servers of a group at the end of the step, to server_c_after."""
+    """Store the server temperatures of a group at the end of the step in server_c_after."""
     for i in range(LANES):
         if count[i] > hall.real(0.0):
             group = hall.places[block_at * LANES + i].first_group + z

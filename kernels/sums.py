@@ -1,9 +1,8 @@
 """Sums and extremes over the racks of a chunk, and over the chunks of a data center.
 
-Rows of SUMS fall in three ranges by when they are wanted. Sums of RACK_MEANS (rows 0 to
-``FIRST_TERM``) are wanted at the end of a step; sums of TERMS up to ``FIRST_OF_SWEEP`` at the end
-as well, over all substeps of transient halls; the rest after every sweep, by the CRAC units and the
-rule to stop.
+The rows of SUMS form three ranges. Sums of RACK_MEANS (rows before ``FIRST_TERM``) are needed at
+the end of a step. Sums of TERMS before ``FIRST_OF_SWEEP`` are also needed at the end, in transient
+halls for all substeps. CRAC units and convergence test need the other rows after every sweep.
 """
 
 from typing import no_type_check
@@ -15,19 +14,19 @@ from .hall_arguments import LANES, RACK_MEANS, RANKS_PER_K, SUMS, TERMS
 
 N_SUMS = len(SUMS)
 FIRST_TERM = len(RACK_MEANS)
-"""First row that is the sum of one of TERMS, in their order."""
+"""First row with the sum of one of TERMS; the rows have the order of TERMS."""
 FIRST_OF_SWEEP = row_index(SUMS, "flow_m3s")
-"""First row that belongs to the present sweep or substep alone."""
+"""First row that concerns only the present sweep or substep."""
 END_OF_TERMS = FIRST_TERM + len(TERMS)
-"""Row behind the last sum."""
+"""Index after the last row with a sum."""
 
 
 @ti.func
 @no_type_check
 def sum_lanes(lanes):
-    """Sum over the lanes of a vector in f64."""
+    """Return the sum over the lanes of a vector, in f64."""
     total = ti.cast(0.0, ti.f64)
-    # Neighbours first, since each addition waits for the one before.
+    # Add neighbours first: it shortens the chain of dependent additions.
     for i in ti.static(range(0, LANES, 4)):
         one = ti.cast(lanes[i], ti.f64) + ti.cast(lanes[i + 1], ti.f64)
         other = ti.cast(lanes[i + 2], ti.f64) + ti.cast(lanes[i + 3], ti.f64)
@@ -38,7 +37,7 @@ def sum_lanes(lanes):
 @ti.func
 @no_type_check
 def sum_racks(hall: ti.template(), chunk_at, row):
-    """Sum over the racks of a chunk of a row of RACK_MEANS, in f64: lane by lane, then lanes."""
+    """Return the sum of a row of RACK_MEANS over the racks of a chunk, in f64."""
     lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
     block_at = hall.chunks[chunk_at].first_block
     while block_at < hall.chunks[chunk_at + 1].first_block:
@@ -52,9 +51,9 @@ def sum_racks(hall: ti.template(), chunk_at, row):
 @ti.func
 @no_type_check
 def sum_chunk(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds):
-    """Rows of SUMS of a chunk from its racks and its TERMS.
+    """Compute rows of SUMS of a chunk from its racks and its TERMS.
 
-    ``adds``: sums of TERMS before FIRST_OF_SWEEP are added to those of the substeps before.
+    ``adds``: add TERMS before FIRST_OF_SWEEP to the sums of earlier substeps.
     """
     row, sums_at = first_row, chunk_at * N_SUMS
     while row < end_row:
@@ -72,25 +71,26 @@ def sum_chunk(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds)
 @ti.func
 @no_type_check
 def rank(hall: ti.template(), temperature_c):
-    """Rank of a temperature, or of each of a vector: those of alike racks are equal."""
+    """Return the rank of each temperature, an integer that is the same for equal racks."""
     return ti.floor(temperature_c * hall.real(RANKS_PER_K) + hall.real(0.5))
 
 
 @ti.func
 @no_type_check
 def find_hottest_rack(hall: ti.template(), chunk_at, hottest: ti.template(), adds):
-    """The hottest of the hottest inlets of each lane of a chunk; of equal ranks the first rack's.
+    """Find the hottest rack of a chunk from the hottest inlet in each lane.
 
-    ``adds``: only where it is hotter than those of the substeps before.
+    Of racks with equal rank, the first counts. ``adds``: the rack must also be hotter than the
+    hottest of earlier substeps.
     """
     chunk = hall.chunks[chunk_at]
     most_c, block, lane, group = hall.real(-1e30), 0, 0, hall.real(0.0)
     highest, i = rank(hall, most_c), 0
     while i < LANES:
         inlet_c = hottest.inlet_c[i]
-        own = rank(hall, inlet_c)
-        if own > highest or (own == highest and hottest.block[i] < block):
-            highest, block, lane, group = own, hottest.block[i], i, hottest.group[i]
+        lane_rank = rank(hall, inlet_c)
+        if lane_rank > highest or (lane_rank == highest and hottest.block[i] < block):
+            highest, block, lane, group = lane_rank, hottest.block[i], i, hottest.group[i]
         most_c = ti.max(inlet_c, most_c)
         i += hall.one
     before_c = chunk.inlet_max_c
@@ -105,7 +105,7 @@ def find_hottest_rack(hall: ti.template(), chunk_at, hottest: ti.template(), add
 @ti.func
 @no_type_check
 def store_change_range(hall: ti.template(), chunk_at, least_k, most_k):
-    """Least and most over the lanes of two vectors, as the bounds of a chunk's mixes."""
+    """Store the extremes over the lanes of two vectors as bounds of the changes of the mixes."""
     chunk, least, most = hall.chunks[chunk_at], hall.real(1e30), hall.real(-1e30)
     for i in range(LANES):
         least = ti.select(least_k[i] < least, least_k[i], least)
@@ -117,7 +117,7 @@ def store_change_range(hall: ti.template(), chunk_at, least_k, most_k):
 @ti.func
 @no_type_check
 def store_present_inlet(hall: ti.template(), chunk_at, inlet_max_c):
-    """Hottest of the hottest inlets of each lane of a chunk in this sweep."""
+    """Store the hottest inlet of a chunk in the present sweep, the maximum over the lanes."""
     most_c = hall.real(-1e30)
     for i in range(LANES):
         most_c = ti.select(inlet_max_c[i] > most_c, inlet_max_c[i], most_c)
@@ -127,7 +127,7 @@ def store_present_inlet(hall: ti.template(), chunk_at, inlet_max_c):
 @ti.func
 @no_type_check
 def add_chunks(hall: ti.template(), n, first_row, end_row):
-    """Rows of SUMS of all chunks of a data center, added up in those of its first chunk."""
+    """Add rows of SUMS of all chunks of a data center to the rows of its first chunk."""
     first = hall.dcs[n].first_chunk
     chunk_at = first + 1
     while chunk_at < hall.dcs[n + 1].first_chunk:
@@ -142,7 +142,7 @@ def add_chunks(hall: ti.template(), n, first_row, end_row):
 @ti.func
 @no_type_check
 def combine_chunks(hall: ti.template(), n):
-    """Sums of the sweep and extremes over all chunks of a data center, to its first chunk."""
+    """Combine sums of the sweep, and extremes, of a data center's chunks in its first chunk."""
     add_chunks(hall, n, FIRST_OF_SWEEP, END_OF_TERMS)
     first = hall.dcs[n].first_chunk
     total, chunk_at = hall.chunks[first], first + 1

@@ -1,4 +1,4 @@
-"""CRAC units of a data center: what the racks ask of them, what they give, and their coils."""
+"""CRAC units of a data center: airflow need of the racks, airflow and supply air, and coils."""
 
 from typing import no_type_check
 
@@ -9,17 +9,17 @@ from .servers import first_share_at
 from .sums import sum_lanes
 
 USUAL_RISE_K = 15.0
-"""Rise of the air through servers, in K, by which fans judge how much their speed matters."""
+"""Typical temperature rise of air through servers, in K, for the gain of the fan control."""
 FAN_RAMP_S = 30.0
-"""Time in which fans follow the hottest inlet, in s, in transient halls."""
+"""Time constant of fans that follow the hottest inlet in transient halls, in s."""
 MOST_PASSES = 100
-"""Most passes over the coils of a data center; as many as saturate one after the other."""
+"""Maximum number of passes over the coils of a data center; each pass may saturate a coil."""
 
 
 @ti.func
 @no_type_check
 def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
-    """Supply air that the racks of a chunk ask of each CRAC unit, sum_j s_jk (1 - r_j) V_j."""
+    """Sum the supply air that the racks of a chunk need of each unit, sum_j s_jk (1 - r_j) V_j."""
     dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
     n_blocks = hall.chunks[chunk_at + 1].first_block - chunk.first_block
@@ -37,7 +37,7 @@ def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
 @ti.func
 @no_type_check
 def unit_need(hall: ti.template(), n, unit):
-    """Supply air that all chunks of a data center ask of one of its units, in m3/s."""
+    """Return the supply air that all chunks of a data center need of one unit, in m3/s."""
     chunk_at, need_m3s = hall.dcs[n].first_chunk, ti.cast(0.0, ti.f64)
     while chunk_at < hall.dcs[n + 1].first_chunk:
         need_m3s += hall.unit_need_m3s[hall.chunks[chunk_at].first_need + unit]
@@ -48,11 +48,11 @@ def unit_need(hall: ti.template(), n, unit):
 @ti.func
 @no_type_check
 def run_crac_units(hall: ti.template(), n, is_last):
-    """Airflow of the CRAC units for what their racks need, and what share of the need it covers.
+    """Set the airflow of the CRAC units to the need of the racks, and the share of it they cover.
 
     Each unit: V_k = clip(need_k / (1 - b_0), low V_k,full, high V_k,full) and
-    f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: no sweep follows, so the state of the units
-    is that at the end of the step.
+    f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: this is the last sweep, so the state of the
+    units is that at the end of the step.
     """
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
     units = ti.Struct(
@@ -60,7 +60,7 @@ def run_crac_units(hall: ti.template(), n, is_last):
         supply_m3k_s=none,
         bypass_m3k_s=none,
         most_f_change=none,
-        # Sums over the running units, whose fans alone draw power.
+        # Sums over running units; the fans of other units draw no power.
         fan_m3s=none,
         running_m3s=none,
         running_m3k_s=none,
@@ -117,11 +117,12 @@ def run_crac_units(hall: ti.template(), n, is_last):
 @ti.func
 @no_type_check
 def follow_hottest_inlet(hall: ti.template(), n, inlet_c):
-    """Speed of the fans after a sweep with the given hottest inlet; return how far off it is, K.
+    """Update the fan speed for the hottest inlet of a sweep; return its distance from target, in K.
 
-    Proportional control: lowest speed at ``inlet_band_k`` below the target, full speed at the
-    target. Inlets answer to the speed s by some -(inlet - supply + rise)/s, so that a step of the
-    difference over 1 plus the gain of the loop neither swings nor stalls.
+    Proportional control: fans run at lowest speed for inlets ``inlet_band_k`` below the target, and
+    at full speed at the target. The derivative of the inlet by the speed s is about
+    -(inlet - supply + rise)/s. Dividing the step by 1 plus the loop gain avoids oscillation and
+    slow convergence.
     """
     dc = hall.dcs[n]
     s, low, band_k = dc.fan_speed, dc.least_speed, dc.inlet_band_k
@@ -139,7 +140,7 @@ def follow_hottest_inlet(hall: ti.template(), n, inlet_c):
 @ti.func
 @no_type_check
 def coil_spare_w(hall: ti.template(), n, at, scale):
-    """Capacity of a coil, times ``scale``, less the heat of its fan, in W; 0 where it is down."""
+    """Return ``scale`` times the capacity of a coil minus its fan heat, in W; 0 if it is down."""
     dc, unit = hall.dcs[n], hall.units[at]
     speed, is_running = unit.speed, ti.cast(unit.running, ti.f64)
     fan_w = dc.crac_fan_w_per_m3s * ti.cast(unit.design_m3s, ti.f64) * speed * speed * speed
@@ -149,11 +150,11 @@ def coil_spare_w(hall: ti.template(), n, at, scale):
 @ti.func
 @no_type_check
 def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
-    """Return air with which the coils take a given load of air, none above its capacity, in C.
+    """Return the return air, in C, at which coils within their capacities remove a load from air.
 
-    Solves sum_k min(C_k, g_k (theta - b_k)) = load for theta by Newton's method, g_k the heat
-    capacity flow of unit k and b_k its supply air without a limit. The sum rises with theta ever
-    less steeply, so steps from below never go too far, and each saturates a coil or is the last.
+    Newton's method solves sum_k min(C_k, g_k (theta - b_k)) = load for theta. g_k is the heat
+    capacity flow of unit k, and b_k its supply air without a limit. The sum is concave in theta, so
+    a step from below never overshoots. Each step saturates another coil or is the last.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
@@ -166,7 +167,7 @@ def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
             g = air * ti.cast(unit.design_m3s, ti.f64) * unit.speed * ti.cast(unit.running, ti.f64)
             wanted_w = g * (theta - ti.cast(unit.setpoint_c, ti.f64) - base_k)
             most_w = coil_spare_w(hall, n, at, scale)
-            # The first pass has no limits, and finds where to begin.
+            # The first pass ignores the limits and finds the starting point.
             if passes > 0 and wanted_w > most_w:
                 taken_w += most_w
             else:
@@ -186,21 +187,22 @@ def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
 @ti.func
 @no_type_check
 def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k, wanted_w):
-    """Supply air of the units in the next sweep; return the largest change, in K.
+    """Set the supply air of the units for the next sweep; return the largest change, in K.
 
-    A unit gives its setpoint plus what the room is warmed by. With return-air control it gives more
-    the less the air warms on its way: b_k = setpoint + gain max(0, rise at design - rise). A coil
-    that would take more than its capacity C_k gives warmer air, theta - C_k / (rho cp V_k), and a
-    unit that is down gives theta, the return air. Where all coils together fall short, all fall
-    short by the same share, which the room keeps.
+    A unit supplies air at its setpoint plus the warmth of the room. With return-air control, supply
+    air is warmer if the air warms less on its way:
+    b_k = setpoint + gain max(0, rise at design - rise). A coil that would have to remove more than
+    its capacity C_k supplies warmer air, theta - C_k / (rho cp V_k). A unit that is down supplies
+    theta, the return air. If the capacity of all coils together is too small, all fall short by the
+    same share, and the room stores the remaining heat.
 
     Args:
-        hall: the hall kernel's arguments.
-        n: data center.
+        hall: arguments of the hall kernel.
+        n: index of the data center.
         units: sums over its units in this sweep.
         return_c: return air of this sweep, in C.
-        warmed_k: what the room is warmed by, beyond what setpoints hold, in K.
-        wanted_w: heat that the running coils are asked to take, in W.
+        warmed_k: warmth of the room that is not part of the setpoints, in K.
+        wanted_w: heat demand on the running coils, in W.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
@@ -237,10 +239,10 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
 @ti.func
 @no_type_check
 def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
-    """Heat that reaches the coils in a substep and what they take out, in W.
+    """Return the heat that reaches the coils in a substep, and the heat that they remove, in W.
 
-    Coils take what brings the supply air back to its setpoint, at most what the plant can. The
-    rest is held by the room and warms the supply air of the next substep.
+    Coils remove the heat that brings supply air back to its setpoint, up to the limit of the plant.
+    The room stores the rest, which warms the supply air of the next substep.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
@@ -267,7 +269,7 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
 @ti.func
 @no_type_check
 def keep_supply(hall: ti.template(), n):
-    """Supply air of the units back to that of the last sweep, which results belong to."""
+    """Reset the supply air of the units to that of the last sweep, to which the results belong."""
     at = hall.dcs[n].first_unit
     while at < hall.dcs[n + 1].first_unit:
         hall.units[at].supply_c = hall.units[at].mean_supply_c

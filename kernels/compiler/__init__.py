@@ -1,5 +1,6 @@
-"""Everything that reaches into Taichi beyond its public interface.
+"""Functions that use Taichi beyond its public interface.
 
-Starting the runtime, launching kernels without Taichi's overhead, and compiling plant equations.
-No equation lives here; kernels/README.md says what each departure from the public interface gains.
+They start the runtime, launch kernels without Taichi's overhead, and compile plant equations. The
+equations themselves are elsewhere. kernels/README.md lists each use of private interfaces, with its
+gain.
 """

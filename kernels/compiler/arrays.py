@@ -1,4 +1,4 @@
-"""NumPy arrays that kernels take as vectors of the processor."""
+"""NumPy arrays with the alignment and layout of SIMD vectors, for kernels."""
 
 import ctypes
 import math
@@ -7,21 +7,22 @@ from typing import Any
 import numpy as np
 
 ALIGNMENT = 512
-"""Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
+"""Alignment in bytes: compiled code expects an array of vectors to start at a multiple of the
+vector's length."""
 F64_LANES = 8
-"""Numbers in f64 that a vector of the processor holds."""
+"""Numbers in f64 per SIMD vector."""
 _SAME_SETS_BYTES = 4096
 
 
 def address_of(array: Any) -> int:
-    """Address of the first byte of an array; ``ndarray.ctypes`` takes four times as long."""
+    """Return the address of an array's first byte, four times as fast as ``ndarray.ctypes``."""
     if array.flags.writeable and array.nbytes:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))
     return int(array.ctypes.data)
 
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Array of undefined content that starts where an array of vectors may start."""
+    """Return an uninitialised array that is aligned for arrays of vectors."""
     element = np.dtype(dtype)
     length = math.prod(shape) * element.itemsize
     raw = np.empty(length + ALIGNMENT, np.uint8)
@@ -30,14 +31,14 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def vector_rows(rows: int, length: int) -> Any:
-    """Rows of f64 of undefined content, padded to whole vectors.
+    """Return uninitialised rows of f64, padded to whole vectors.
 
-    Rows that are multiples of 4 KiB apart compete for the same sets of the processor's cache, and a
-    kernel that reads many of them at a time takes twice as long. Such rows get one vector more.
+    Rows at distances of multiples of 4 KiB compete for the same sets of the processor's cache. A
+    kernel that reads many such rows together takes twice as long, so they get one more vector.
 
     Args:
         rows: number of rows.
-        length: entries of a row.
+        length: number of entries in a row.
 
     Returns:
         An array (rows, vectors, F64_LANES).
@@ -48,5 +49,5 @@ def vector_rows(rows: int, length: int) -> Any:
 
 
 def unpadded(rows: Any, length: int) -> Any:
-    """View of ``vector_rows`` without their padding, (rows, length)."""
+    """Return a view of ``vector_rows`` without padding, (rows, length)."""
     return rows.reshape(len(rows), -1)[:, :length]

@@ -1,7 +1,7 @@
-"""Calling a kernel again and again, without what Taichi does anew at every call.
+"""Repeated kernel calls without the work that Taichi repeats at every call.
 
-kernels/README.md says what each departure from Taichi's public interface gains, and how
-``SDC_TAICHI_PLAIN`` turns all of them off.
+kernels/README.md lists each use of Taichi's private interfaces, with its gain, and says how
+``SDC_TAICHI_PLAIN`` disables all of them.
 """
 
 import threading
@@ -20,7 +20,7 @@ from .runtime import uses_plain_taichi
 
 @contextmanager
 def no_positions() -> Iterator[None]:
-    """Replace what finds, formats and passes on the position of every node, and put it back."""
+    """Disable Taichi's tracking of source positions during translation, and restore it on exit."""
     nowhere = core.DebugInfo("")
     places: tuple[tuple[Any, str, Any], ...] = (
         (Builder, "__call__", _build),
@@ -39,26 +39,26 @@ def no_positions() -> Iterator[None]:
 
 
 def _build(builder: Any, context: Any, node: Any) -> Any:
-    """Translate a node; its errors are found again, with positions, by a second translation."""
+    """Translate a syntax node; ``_translate`` repeats a failed translation to get positions."""
     return getattr(builder, f"build_{type(node).__name__}")(context, node)
 
 
 OPTIONS = {"fast_math": False, "real_matrix_scalarize": False}
-"""Options that kernels are compiled with, also in a runtime that another library started.
+"""Compiler options of all kernels, also in a runtime that another library started.
 
-Without ``fast_math`` a sum has the same bits in every kernel. Without ``real_matrix_scalarize`` a
-vector is loaded, stored and computed as one vector of the processor."""
+Without ``fast_math``, a sum has the same bits in every kernel. Without ``real_matrix_scalarize``,
+Taichi loads, stores and computes a vector as one SIMD vector."""
 
 _compiling = threading.RLock()
-"""Held while options are set: they belong to the runtime, which the whole process shares."""
+"""Lock for changes of compiler options, which belong to the runtime of the whole process."""
 
 
 class BoundKernel:
-    """A kernel that is called again and again with mostly the same arrays.
+    """A kernel for repeated calls with mostly the same arrays.
 
-    Taichi checks and hands over every argument at every call, 7 us for an array. A bound kernel
-    keeps the launch context of its last call with the same template arguments, and hands over
-    scalars and those arrays that are other objects than before.
+    Taichi checks and passes every argument at every call, which takes 7 us per array. A bound
+    kernel reuses the launch context of its last call with equal template arguments. It passes only
+    scalars and those arrays that are different objects than before.
 
     Args:
         kernel: a Taichi kernel with template arguments first, then scalars and NumPy arrays.
@@ -75,42 +75,42 @@ class BoundKernel:
 
         Args:
             args: template arguments, numbers, and C-contiguous arrays of the types that the kernel
-                names; those of vectors start at multiples of the vector's length.
+                declares. Arrays of vectors start at multiples of the vector's length.
 
         Raises:
-            TypeError: an array of another type, order or alignment (of another type or order what
-                Taichi raises, where its public interface is called).
+            TypeError: if an array has another type, order or alignment. (In plain mode, Taichi
+                raises its own error for another type or order.)
         """
         if self._plain:
             with _compiling, _options(ti.cfg):
                 self._kernel(*args)
             return
-        key, given = args[: self._templates], args[self._templates :]
+        key, values = args[: self._templates], args[self._templates :]
         launch = self._launches.get(key)
         if launch is None or launch.program is not ti.lang.impl.get_runtime().prog:
             with _compiling:
                 launch = self._launches[key] = _Launch(self._kernel, args, self._templates)
-        launch.run(given)
+        launch.run(values)
 
     def release(self, *arrays: Any) -> None:
-        """Drop arrays of past calls, which otherwise live until others take their places."""
+        """Drop references to arrays of past calls; otherwise they live until they are replaced."""
         for launch in self._launches.values():
             launch.release({id(array) for array in arrays})
 
 
 def run_once(kernel: Any, **arguments: Any) -> None:
-    """Run a kernel that is seldom called, through Taichi's public interface, with OPTIONS.
+    """Run a rarely called kernel through Taichi's public interface, with OPTIONS.
 
     Args:
         kernel: a Taichi kernel.
-        arguments: its arguments by name.
+        arguments: arguments of the kernel, by name.
     """
     with _compiling, _options(ti.cfg):
         kernel(**arguments)
 
 
 class _Launch:
-    """One compiled kernel with its arguments in place."""
+    """One compiled kernel with a launch context that holds its arguments."""
 
     def __init__(self, kernel: Any, args: tuple[Any, ...], templates: int) -> None:
         primal = kernel._primal
@@ -123,25 +123,25 @@ class _Launch:
         self._context = translated.make_launch_context()
         annotations = [argument.annotation for argument in primal.arguments[templates:]]
         self._element_dims = [getattr(getattr(a, "dtype", None), "ndim", 0) for a in annotations]
-        self._given: list[Any] = [None] * len(annotations)
-        """Arguments that the context holds."""
+        self._passed: list[Any] = [None] * len(annotations)
+        """Arguments in the context."""
         self._kinds: list[Any] = [None] * len(annotations)
-        """Type and number of dimensions of arrays, those of the first call."""
+        """Type and number of dimensions of each array, from the first call."""
         self._set(args[templates:])
 
-    def run(self, given: tuple[Any, ...]) -> None:
-        """Run the kernel with arguments that are not templates."""
-        self._set(given)
+    def run(self, values: tuple[Any, ...]) -> None:
+        """Run the kernel; ``values`` are the arguments after the template arguments."""
+        self._set(values)
         self.program.launch_kernel(self._compiled, self._context)
 
     def release(self, arrays: set[int]) -> None:
-        """Drop arrays by identity."""
-        self._given = [None if id(value) in arrays else value for value in self._given]
+        """Drop references to the arrays with these ``id`` values."""
+        self._passed = [None if id(value) in arrays else value for value in self._passed]
 
-    def _set(self, given: tuple[Any, ...]) -> None:
-        """Hand over arguments that are other objects than those of the last call."""
-        context, last, kinds = self._context, self._given, self._kinds
-        for i, value in enumerate(given):
+    def _set(self, values: tuple[Any, ...]) -> None:
+        """Pass the arguments that are different objects than in the last call."""
+        context, last, kinds = self._context, self._passed, self._kinds
+        for i, value in enumerate(values):
             if value is last[i]:
                 continue
             if isinstance(value, np.ndarray):
@@ -164,9 +164,9 @@ class _Launch:
 
 
 def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
-    """Translate a kernel for such arguments; return the key by which Taichi finds it.
+    """Translate a kernel for these arguments; return the key of the result in Taichi's table.
 
-    Whole numbers in kernels have 32 bits, whatever the options of the runtime.
+    Whole numbers in kernels have 32 bits, whatever the options of the runtime are.
     """
     runtime = ti.lang.impl.get_runtime()
     before = runtime.default_ip
@@ -176,7 +176,7 @@ def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
             with no_positions():
                 return primal.ensure_compiled(*args)
         except Exception:
-            # Once more for the message, which says where in the source the error is.
+            # Translate again with positions, so that the message names the line of the error.
             return primal.ensure_compiled(*args)
     finally:
         runtime.default_ip = before
@@ -184,7 +184,7 @@ def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
 
 @contextmanager
 def _options(config: Any) -> Iterator[Any]:
-    """Set OPTIONS in a configuration, and put back what was there on leaving."""
+    """Set OPTIONS in a configuration, and restore the previous values on exit."""
     before = {name: getattr(config, name) for name in OPTIONS}
     try:
         for name, value in OPTIONS.items():

@@ -1,4 +1,4 @@
-"""Kernels defined from a spec of their arguments, and called by name."""
+"""Kernels that are defined from a spec of their arguments, and called with named arguments."""
 
 import linecache
 from collections import namedtuple
@@ -14,18 +14,18 @@ from .launch import BoundKernel
 
 
 def define(name: str, source: str, file: str, scope: Mapping[str, Any]) -> Any:
-    """Define a function from its source, and keep the source where Taichi looks for it.
+    """Define a function from source text, and register the text where Taichi reads it.
 
     Args:
-        name: of the function in the source.
-        source: Python source of the function with its decorators.
-        file: name that stands for the source in messages, different for each source.
+        name: name of the function in the source.
+        source: Python source of the function, with its decorators.
+        file: file name for messages; each source needs a different name.
         scope: globals of the function.
 
     Returns:
         The function.
     """
-    # Taichi reads the source of a kernel by the name of its file, as `inspect` does.
+    # Like `inspect`, Taichi finds the source of a kernel through the name of its file.
     linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
     names = dict(scope)
     exec(compile(source, file, "exec"), names)
@@ -33,19 +33,19 @@ def define(name: str, source: str, file: str, scope: Mapping[str, Any]) -> Any:
 
 
 class NamedRows:
-    """Arrays of named rows within a kernel: ``rows[i].name``, to read and to assign.
+    """Arrays with named rows inside a kernel, read and assigned as ``rows[i].name``.
 
     An array of two dimensions has a row for each name and a column for each item. In an array of
-    one dimension the values of an item stand next to each other.
+    one dimension, the values of an item are adjacent.
 
     Args:
-        parts: pairs of the names of the rows of an array, and the array.
-        stride: in arrays of one dimension, entries from an item to the next; None is the number of
-            names, and with 1 the index of an item is that of its first entry.
+        parts: pairs of row names and array.
+        stride: distance between items in arrays of one dimension, in entries. None stands for the
+            number of names. With 1, the index of an item is the index of its first entry.
     """
 
     _data_oriented = True
-    """Taichi hands objects of such classes to functions as they are."""
+    """Mark for Taichi to pass objects of this class to functions unchanged."""
 
     def __init__(self, *parts: tuple[tuple[str, ...], Any], stride: int | None = None) -> None:
         self._places: dict[str, tuple[Any, int, int]] = {}
@@ -58,10 +58,10 @@ class NamedRows:
 
 
 class Item:
-    """The values of one item of :class:`NamedRows`; every use reads or writes the array anew.
+    """Values of one item of :class:`NamedRows`; each use reads from or writes to the array.
 
     Args:
-        places: array, row, and entries from an item to the next (0 in two dimensions) by name.
+        places: by name: array, row, and distance between items in entries (0 in two dimensions).
         i: index of the item.
     """
 
@@ -79,12 +79,12 @@ class Item:
 
 
 def local(value: Any) -> Any:
-    """Copy of a number within a kernel; arguments that are not copied are read at every use."""
+    """Return a copy of a number inside a kernel; without it, each use reads the argument again."""
     return ti.lang.impl.expr_init(value) if isinstance(value, ti.lang.expr.Expr) else value
 
 
 def shared(**values: Any) -> Any:
-    """Namedtuple of values that the functions of a kernel share; to be called in ``ti.static``."""
+    """Return a namedtuple of values for the functions of a kernel; call it in ``ti.static``."""
     values = {name: local(value) for name, value in values.items()}
     return namedtuple("Shared", values)(**values)
 
@@ -99,8 +99,8 @@ def {name}({parameters}):
             hall = ti.static(share(zeros=ti.Vector([ti.cast(0.0, real)] * {lanes}), {named}))
             run_slice(hall, k // {slice})
 """
-"""A loop over slices, each of which runs on one thread. Taichi reads the parameters of a kernel
-from its source, so this source is filled in from the spec."""
+"""Source template of a kernel: a loop over slices, each of which runs on one thread. Taichi reads
+the parameters of a kernel from its source, so ``define_kernel`` fills them in from the spec."""
 
 
 def define_kernel(
@@ -113,20 +113,20 @@ def define_kernel(
     constants: Mapping[str, Any] = _NONE,
     views: Mapping[str, tuple[Mapping[str, str], str]] = _NONE,
 ) -> Any:
-    """Taichi kernel with the arguments of a spec.
+    """Define a Taichi kernel with the arguments of a spec.
 
     Args:
-        name: of the kernel.
-        arguments: spec of the arguments by name, those that are templates first; ``serial`` and
-            ``slices`` among them.
-        run_slice: Taichi function (hall, slice) that does the part of a slice. ``hall`` has as
-            attributes the arguments, the items whose rows they hold, constants and views, ``real``,
-            and ``zeros``, a vector of lanes.
+        name: name of the kernel.
+        arguments: spec of the arguments by name, template arguments first. ``serial`` and
+            ``slices`` must be among them.
+        run_slice: Taichi function (hall, slice) that computes one slice. The attributes of ``hall``
+            are the arguments, items with named rows, constants, views, ``real``, and ``zeros``, a
+            vector of lanes.
         precision: ``f32`` or ``f64``, the type of ``real`` arguments.
         lanes: length of ``zeros``.
         constants: values known when the kernel is compiled, by name.
-        views: by name, rows that are found by the place of the first in an array of one dimension,
-            and the name of that array.
+        views: further items by name, each with its rows and the name of an array of one dimension.
+            The index of an item is the index of its first entry in the array.
     """
     real = reals(precision)
 
@@ -161,7 +161,7 @@ def define_kernel(
 
 
 def _type(argument: Argument, real: Any) -> Any:
-    """Taichi's type of an argument."""
+    """Return the Taichi type of an argument."""
     if argument.kind == "template":
         return ti.template()
     element = {"i32": ti.i32, "f64": ti.f64, "real": real}[argument.kind]
@@ -173,11 +173,11 @@ def _type(argument: Argument, real: Any) -> Any:
 
 
 class NamedKernel:
-    """A kernel called with its arguments by name, which stay until they are given again.
+    """A kernel with named arguments; a bound argument remains until it is replaced.
 
     Args:
-        kernel: a kernel of ``define_kernel``.
-        arguments: the spec that it was defined from.
+        kernel: a kernel from ``define_kernel``.
+        arguments: the spec from which it was defined.
     """
 
     def __init__(self, kernel: Any, arguments: Mapping[str, Argument]) -> None:
@@ -187,10 +187,10 @@ class NamedKernel:
         self._missing = set(arguments)
 
     def bind(self, **values: Any) -> None:
-        """Set arguments for this and later calls.
+        """Set arguments for the next call and later calls.
 
         Raises:
-            TypeError: a name that is no argument of the kernel.
+            TypeError: if a name is not an argument of the kernel.
         """
         if not values.keys() <= self._values.keys():
             unknown = sorted(values.keys() - self._values.keys())
@@ -199,11 +199,11 @@ class NamedKernel:
         self._missing -= values.keys()
 
     def __call__(self, **values: Any) -> None:
-        """Run the kernel with these arguments, and those that were given before.
+        """Run the kernel with these arguments and those bound before.
 
         Raises:
-            TypeError: a name that is no argument, an argument that was never given, or an array
-                of another type, order or alignment than the spec says.
+            TypeError: if a name is unknown, an argument was never bound, or an array differs in
+                type, order or alignment from the spec.
         """
         self.bind(**values)
         if self._missing:
@@ -211,7 +211,7 @@ class NamedKernel:
         self._launch(*self._values.values())
 
     def release(self, *names: str) -> None:
-        """Let go of arguments, which the next call has to give again."""
+        """Drop bound arguments; they must be given again before or in the next call."""
         self._launch.release(*(self._values[name] for name in names))
         self._values.update(dict.fromkeys(names))
         self._missing.update(names)

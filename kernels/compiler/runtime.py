@@ -1,4 +1,4 @@
-"""Start Taichi once, on the CPU, at the first reset or step; refuse to run in a forked child."""
+"""Start of Taichi, once per process on the CPU; a forked child raises an error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sdc_taichi.number_text import parse_whole
 
 
 def allowed_processors() -> list[int]:
-    """Numbers of the processors that this process may run on, ascending."""
+    """Return the numbers of the processors on which this process may run, ascending."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
@@ -31,14 +31,15 @@ def allowed_processors() -> list[int]:
 def processor_quota(
     groups: Path = Path("/proc/self/cgroup"), mounted: Path = Path("/sys/fs/cgroup")
 ) -> float:
-    """Processors whose time the process is granted, as in containers; inf without a quota.
+    """Return the CPU quota of this process in processors, as in containers; inf without a quota.
 
     Args:
-        groups: control groups of the process, one per line (cgroups(7) of Linux).
-        mounted: where their settings are. In a container these may begin below the groups' paths.
+        groups: file with the control groups of the process, one per line (cgroups(7) of Linux).
+        mounted: folder of the settings of control groups. Inside a container it may start below the
+            paths of the groups.
 
     Returns:
-        The least quota of the groups and those above, rounded up.
+        The smallest quota of the groups and their parents, rounded up.
     """
     quotas = [math.inf]
     for line in _text(groups).split("\n"):
@@ -53,22 +54,22 @@ def processor_quota(
                 period_us = _text(mounted / "cpu" / folder / "cpu.cfs_period_us")
             else:
                 continue
-            # "max" or -1 without a quota.
+            # Without a quota the value is "max" or -1.
             if quota_us.strip().isdecimal() and period_us.strip().isdecimal() and int(period_us):
                 quotas.append(max(1, math.ceil(int(quota_us) / int(period_us))))
     return min(quotas)
 
 
 def _text(file: Path) -> str:
-    """Text of a file of the operating system; empty if it cannot be read."""
+    """Return the text of a file of the operating system, or an empty text if it is unreadable."""
     try:
         return file.read_text("utf-8", errors="replace")
-    except (OSError, ValueError):  # the latter of names that no file may have
+    except (OSError, ValueError):  # ValueError: invalid file name
         return ""
 
 
 def _thread_ids() -> set[int]:
-    """Threads of this process; none where the system does not tell."""
+    """Return the thread numbers of this process, or an empty set if the system has no list."""
     try:
         return set(map(int, os.listdir("/proc/self/task")))
     except OSError:
@@ -76,16 +77,16 @@ def _thread_ids() -> set[int]:
 
 
 def _bind(threads: set[int], count: int) -> None:
-    """Bind threads that compute together to one processor each, if there is one for each.
+    """Bind each computing thread to one processor, if there are as many threads as processors.
 
-    Linux tends to wake all of them on the processor of the thread that waits for them, and moves
-    them apart some milliseconds later, when the step is done. Where threads are fewer or more than
-    processors, they are left to the system, which also serves processes beside this one.
+    Linux tends to wake all threads on the processor of the waiting thread, and distributes them
+    some milliseconds later, after the step is done. If the numbers of threads and processors
+    differ, the operating system places the threads, as it also serves other processes.
 
     Args:
-        threads: numbers of the threads; those that compute follow each other, others may be among
-            them.
-        count: how many of them compute at a time.
+        threads: thread numbers; computing threads have consecutive numbers, and other threads may
+            be among them.
+        count: number of threads that compute at a time.
     """
     processors = allowed_processors()
     if count != len(processors) or not hasattr(os, "sched_setaffinity"):
@@ -96,28 +97,28 @@ def _bind(threads: set[int], count: int) -> None:
 
 
 CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
-"""Environment variable that names Taichi's folder of compiled kernels; obeyed here too."""
+"""Environment variable for Taichi's folder of compiled kernels, which this module also follows."""
 LOCK_S = 60.0
-"""Age, in s, from which a lock of the folder is one that a killed process left; Taichi holds it for
-milliseconds."""
+"""Age of the folder's lock file, in s, from which it counts as the remnant of a killed process;
+Taichi holds the lock for milliseconds."""
 _LOCK = "ticache.lock"
 _OWN = {
     "ENABLE_TAICHI_HEADER_PRINT": "False",
     "TI_SKIP_VERSION_CHECK": "ON",
-    # In notebooks it would print that there is one, and look for text to print at each launch.
+    # Otherwise Taichi prints a banner in notebooks and polls its print buffer at every launch.
     "TI_ENABLE_PYBUF": "0",
 }
 
 
 class KernelCacheWarning(SdcWarning):
-    """Compiled kernels cannot be kept for the next process."""
+    """Warning that compiled kernels cannot be stored for the next process."""
 
 
 @contextlib.contextmanager
 def taichi_environment() -> Iterator[None]:
-    """Hide the variables by which users set up other programs of Taichi, such as ``TI_ARCH``.
+    """Hide environment variables meant for other Taichi programs, such as ``TI_ARCH``.
 
-    Taichi also aborts the process where there is neither ``HOME`` nor ``XDG_CACHE_HOME``.
+    If neither ``HOME`` nor ``XDG_CACHE_HOME`` is set, set ``HOME``: Taichi would abort the process.
     """
     hidden = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("TI_")}
     hidden |= {name: os.environ[name] for name in _OWN if name in os.environ}
@@ -134,13 +135,14 @@ def taichi_environment() -> Iterator[None]:
 
 
 def kernel_folder() -> Path:
-    """Folder in which Taichi keeps compiled kernels, fit to be used.
+    """Return a writable folder for Taichi's compiled kernels.
 
-    On Linux it is that of all programs of Taichi, or that of ``CACHE_VARIABLE``. Where none can be
-    written, it is a temporary one, which is deleted at exit, with a ``KernelCacheWarning``.
+    On Linux it is the common folder of all Taichi programs, or that of ``CACHE_VARIABLE``. If that
+    folder is not writable, create a temporary folder, deleted at exit, and give a
+    ``KernelCacheWarning``.
 
     Raises:
-        RuntimeStateError: no temporary folder can be written either.
+        RuntimeStateError: if no temporary folder can be created either.
     """
     folder = usual_folder()
     try:
@@ -155,7 +157,7 @@ def kernel_folder() -> Path:
 
 
 def usual_folder() -> Path:
-    """Folder in which programs of Taichi keep their kernels."""
+    """Return the folder in which Taichi programs store their compiled kernels."""
     import platformdirs
 
     if named := os.environ.get(CACHE_VARIABLE):
@@ -164,39 +166,39 @@ def usual_folder() -> Path:
 
 
 def _make_usable(folder: Path) -> None:
-    """Create the folder of kernels, and delete a lock that a killed process has left there.
+    """Create the folder of kernels, and delete a lock left there by a killed process.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: if the folder is not writable.
     """
-    if not folder.is_absolute():  # the system knows no home of this user
+    if not folder.is_absolute():  # the user has no home folder
         raise OSError("no absolute path")
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass
     lock = folder / _LOCK
-    # Taichi would wait 2 s for it at every start, and then keep no kernels.
+    # With an old lock, Taichi would wait 2 s at every start and then store no kernels.
     with contextlib.suppress(FileNotFoundError):
         if time.time() - lock.stat().st_mtime > LOCK_S:
             lock.unlink()
 
 
 def _temporary_folder(folder: Path) -> Path:
-    """Folder of kernels that is deleted at exit.
+    """Return a temporary folder for kernels that is deleted at exit.
 
     Args:
-        folder: the one that cannot be written.
+        folder: the usual folder, which is not writable.
 
     Raises:
-        RuntimeStateError: none can be created.
+        RuntimeStateError: if no temporary folder can be created.
     """
     for parent in (None, "/dev/shm"):
         try:
-            made = tempfile.mkdtemp(prefix="sdc-taichi-", dir=parent)
+            path = tempfile.mkdtemp(prefix="sdc-taichi-", dir=parent)
         except OSError:
             continue
-        atexit.register(_delete_at_exit, made, os.getpid())
-        return Path(made)
+        atexit.register(_delete_at_exit, path, os.getpid())
+        return Path(path)
     raise RuntimeStateError(
         f"{folder}: cannot be written, nor can a temporary folder; valid is a folder for kernels "
         "in XDG_CACHE_HOME, or for temporary files in TMPDIR"
@@ -204,7 +206,7 @@ def _temporary_folder(folder: Path) -> Path:
 
 
 def _delete_at_exit(folder: str, owner: int) -> None:
-    """Delete a temporary folder of kernels, once Taichi, which writes to it last, has ended."""
+    """Delete a temporary folder of kernels at exit, after Taichi's last write to it."""
     if os.getpid() != owner:
         return
     if "taichi" in sys.modules:
@@ -214,17 +216,16 @@ def _delete_at_exit(folder: str, owner: int) -> None:
 
 
 MOST_THREADS = 1024
-"""Largest number of threads that may be asked for: more than any machine has processors that gain
-from it."""
+"""Largest number of threads that a user may request; no machine gains from more threads."""
 
 _forked = False
 _starting = threading.Lock()
 _known: tuple[object, int] = (None, 0)
-"""Runtime of the last call and its threads, which take a while to ask for."""
+"""Runtime at the last call and its number of threads, cached because the query is slow."""
 
 
 def _mark_child() -> None:
-    """Remember in a forked child that its parent had a runtime, its own or another library's."""
+    """Record in a forked child whether Taichi was already started in its parent."""
     global _forked
     taichi = sys.modules.get("taichi")
     _forked = taichi is not None and taichi.cfg is not None
@@ -235,10 +236,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def uses_plain_taichi() -> bool:
-    """Whether kernels are to be called through Taichi's public interface alone.
+    """Return True if kernels must be called through Taichi's public interface only.
 
     Raises:
-        ConfigError: ``SDC_TAICHI_PLAIN`` is neither 0 nor 1.
+        ConfigError: if ``SDC_TAICHI_PLAIN`` is neither 0 nor 1.
     """
     text = os.environ.get("SDC_TAICHI_PLAIN", "").strip()
     if text not in ("", "0", "1"):
@@ -247,17 +248,17 @@ def uses_plain_taichi() -> bool:
 
 
 def ensure_started() -> int:
-    """Start the runtime when none exists and return its number of threads.
+    """Start the Taichi runtime if none exists; return its number of threads.
 
-    A runtime that another library started is used as it is: a second start would destroy the
-    fields of the first. One started here has a thread for each processor that the process may
-    use, no more than the quotas of its control groups grant, or ``SDC_TAICHI_THREADS``.
+    A runtime of another library is used as it is, because a second start would destroy the fields
+    of the first. A runtime started here has one thread for each processor available to the
+    process, limited by the quotas of its control groups, or ``SDC_TAICHI_THREADS`` threads.
 
     Raises:
-        RuntimeStateError: in a child forked after the start, where Taichi would hang; or the
-            runtime was started with whole numbers of another length than 32 bits, and
-            ``SDC_TAICHI_PLAIN`` is 1; or Taichi cannot be loaded or started.
-        ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
+        RuntimeStateError: in a child forked after the start, where Taichi would hang; if Taichi
+            cannot be loaded or started; or if ``SDC_TAICHI_PLAIN`` is 1 and the runtime was started
+            with whole numbers of other than 32 bits.
+        ConfigError: if ``SDC_TAICHI_THREADS`` is not a positive integer.
     """
     global _known
     if _forked:
@@ -270,7 +271,7 @@ def ensure_started() -> int:
         _import_taichi()
     import taichi as ti
 
-    # Gives the same as `ti.cfg` in a fifteenth of the time: steps ask several times.
+    # This is equivalent to a check of `ti.cfg`, in a fifteenth of the time; steps call it often.
     runtime = ti.lang.impl.get_runtime
     if _known[0] is None or _known[0] is not runtime().prog:
         with _starting:
@@ -289,7 +290,7 @@ def _import_taichi() -> None:
     """Import Taichi.
 
     Raises:
-        RuntimeStateError: it is not installed, or memory is short.
+        RuntimeStateError: if Taichi is not installed, or memory is short.
     """
     with _starting, taichi_environment():
         try:
@@ -299,11 +300,11 @@ def _import_taichi() -> None:
 
 
 def _start_taichi() -> None:
-    """Start Taichi.
+    """Start Taichi with the number of threads of ``ensure_started``.
 
     Raises:
-        RuntimeStateError: memory is short.
-        ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
+        RuntimeStateError: if Taichi cannot start, for example because memory is short.
+        ConfigError: if ``SDC_TAICHI_THREADS`` is not a positive integer.
     """
     import taichi as ti
 
@@ -319,8 +320,8 @@ def _start_taichi() -> None:
                 log_level=ti.CRITICAL,
                 cpu_max_num_threads=threads,
             )
-            # Taichi sets up memory at the first launch or here, which has to be in the thread that
-            # starts.
+            # Taichi allocates memory at the first launch or here; it must be in the thread that
+            # starts it.
             ti.sync()
         except (RuntimeError, MemoryError) as error:
             raise RuntimeStateError(
@@ -333,7 +334,7 @@ def _start_taichi() -> None:
 
 @contextlib.contextmanager
 def _without_banner() -> Iterator[None]:
-    """Drop what Taichi prints at its start; pass on what other threads print meanwhile."""
+    """Drop Taichi's own messages at its start; pass on what other threads print meanwhile."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         yield
     for line in printed.getvalue().splitlines(keepends=True):
@@ -342,7 +343,7 @@ def _without_banner() -> Iterator[None]:
 
 
 def _thread_limit() -> int:
-    """Number of threads that the environment asks for; 0 where it asks for none."""
+    """Return the number of threads requested by the environment; 0 for no request."""
     text = os.environ.get("SDC_TAICHI_THREADS", "").strip()
     if not text:
         return 0

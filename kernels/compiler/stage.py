@@ -1,11 +1,11 @@
-"""Stage functions compiled: the same function over arrays, in one pass over its entries.
+"""Compilation of stage functions: a NumPy function becomes one kernel that runs over all entries.
 
 A stage is a plain function whose arrays all have one entry per data center. It is called once with
-quantities that write down what is done to them; from that trace a kernel is made,
-which computes F64_LANES entries at a time, as vectors of the processor, and keeps nothing in
-between. Whatever the stage reads apart from its arguments is taken as constant. NumPy needs a call
-and a temporary per operation, and some hundred of them cost more than the arithmetic unless there
-are thousands of data centers.
+traced quantities, which record the operations instead of computing them. The record becomes the
+source of a kernel. The kernel computes F64_LANES entries at a time as SIMD vectors and stores no
+intermediate results. Values that the stage reads from elsewhere than its arguments become
+constants. NumPy needs a call and a temporary array per operation; for a hundred operations this
+overhead exceeds the arithmetic, unless there are thousands of data centers.
 """
 
 from collections import Counter
@@ -27,7 +27,7 @@ from .launch import BoundKernel
 from .named_kernel import define
 
 _LONGEST_TERM = 80
-"""Letters of a quantity that is written within another."""
+"""Maximum number of characters of an expression that is inserted into another expression."""
 
 _NUMBERS = {
     np.add: "{} + {}",
@@ -57,45 +57,46 @@ _LOGIC = {
 
 
 class Traced(NDArrayOperatorsMixin):
-    """A quantity of a traced function; what is done to it is written down, not done.
+    """A quantity in a traced function, which records operations instead of computing them.
 
     Args:
-        trace: the trace that it belongs to.
+        trace: trace to which the quantity belongs.
         at: number of the operation whose result it is.
-        truth: whether it is true or false instead of a number.
-        rows: row of the inputs that it is, if it is an argument.
+        truth: True for a truth value, False for a number.
+        rows: its row in the inputs, if it is an argument.
     """
 
     def __init__(self, trace: "Trace", at: int, truth: bool, rows: tuple[int, ...] = ()) -> None:
         self.trace, self.at, self.truth, self.rows = trace, at, truth, rows
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **more: Any) -> "Traced":
+    def __array_ufunc__(self, ufunc: Any, method: str, *operands: Any, **more: Any) -> "Traced":
         if method != "__call__" or more:
             raise TypeError(f"{ufunc.__name__}: only plain calls can be compiled")
         if ufunc is np.power:
-            return _power(self.trace.lift(given[0]), given[1])
+            return _power(self.trace.lift(operands[0]), operands[1])
         if ufunc is np.rint:
-            return _rint(self.trace.lift(given[0]))
+            return _rint(self.trace.lift(operands[0]))
         if ufunc in _NUMBERS:
-            return self.trace.operation(_NUMBERS[ufunc], given)
+            return self.trace.operation(_NUMBERS[ufunc], operands)
         if ufunc in _COMPARISONS:
-            return self.trace.operation(_COMPARISONS[ufunc], given, truth=True)
+            return self.trace.operation(_COMPARISONS[ufunc], operands, truth=True)
         if ufunc in _LOGIC:
-            return self.trace.operation(_LOGIC[ufunc], given, of_truths=len(given), truth=True)
+            count = len(operands)
+            return self.trace.operation(_LOGIC[ufunc], operands, of_truths=count, truth=True)
         raise TypeError(f"{ufunc.__name__}: cannot be compiled")
 
     def __array_function__(
-        self, function: Any, types: Any, given: tuple[Any, ...], more: dict[str, Any]
+        self, function: Any, types: Any, operands: tuple[Any, ...], more: dict[str, Any]
     ) -> Any:
-        if function is np.where and len(given) == 3:
-            return self.trace.operation("ti.select({}, {}, {})", given, of_truths=1)
-        if function is np.clip and len(given) == 3:
-            return np.minimum(np.maximum(given[0], given[1]), given[2])
-        if function is np.round and len(given) == 2:
-            scale = 10.0 ** given[1]
-            return np.rint(given[0] * scale) / scale
+        if function is np.where and len(operands) == 3:
+            return self.trace.operation("ti.select({}, {}, {})", operands, of_truths=1)
+        if function is np.clip and len(operands) == 3:
+            return np.minimum(np.maximum(operands[0], operands[1]), operands[2])
+        if function is np.round and len(operands) == 2:
+            scale = 10.0 ** operands[1]
+            return np.rint(operands[0] * scale) / scale
         if function is np.broadcast_arrays:
-            return given
+            return operands
         raise TypeError(f"{function.__name__}: cannot be compiled")
 
     def __bool__(self) -> bool:
@@ -103,21 +104,21 @@ class Traced(NDArrayOperatorsMixin):
 
 
 class TracedObject:
-    """An argument whose arrays are its attributes; those that the function reads are written down.
+    """An argument with arrays as attributes, which records those that the function reads.
 
     Args:
-        trace: the trace that it belongs to.
-        value: the object.
+        trace: trace to which the argument belongs.
+        value: the object with the arrays.
     """
 
     def __init__(self, trace: "Trace", value: Any) -> None:
         self._trace, self._value = trace, value
         self.read: dict[str, Traced] = {}
-        """Quantities that have been read, by the names of their attributes."""
+        """Quantities that the function has read, by attribute name."""
 
     @property
     def rows(self) -> list[int]:
-        """Rows of the inputs that hold the attributes read, in their order."""
+        """Rows of the inputs for the attributes that were read, in the order of reading."""
         return [row for quantity in self.read.values() for row in quantity.rows]
 
     def __getattr__(self, name: str) -> Traced:
@@ -130,26 +131,26 @@ class TracedObject:
 
 
 class Trace:
-    """Operations of a function on arrays (n,), each different operation once.
+    """Record of the operations of a function on arrays (n,), without duplicates.
 
     Args:
-        size: n.
+        size: number of entries n.
     """
 
     def __init__(self, size: int) -> None:
         self.size = size
         self.inputs = 0
-        """Number of arrays that are arguments, or attributes of them."""
+        """Number of input arrays: arguments, or attributes of arguments."""
         self._operations: dict[tuple[str, tuple[int, ...]], int] = {}
         self._known: dict[int, tuple[str, Any]] = {}
-        """Text that reads a constant, and the constant, by its identity."""
+        """Text that reads a constant, and the constant itself, by the constant's ``id``."""
         self.shared: list[float] = []
-        """Constants that are the same for all entries, which need not be read for each."""
+        """Constants with one value for all entries, which need not be loaded per entry."""
         self.constants: list[Any] = []
-        """Constants that differ between entries, each (n,)."""
+        """Constants with a value per entry, each (n,)."""
 
     def argument(self, value: Any) -> Any:
-        """A quantity in a row of the inputs for an array or number; an object for its arrays."""
+        """Return a traced quantity for an array or number, or a traced object for an object."""
         if not isinstance(value, np.ndarray | float | int):
             return TracedObject(self, value)
         row, self.inputs = self.inputs, self.inputs + 1
@@ -157,40 +158,40 @@ class Trace:
         return Traced(self, at, truth=False, rows=(row,))
 
     def entry(self, text: str, *, of: tuple[int, ...] = (), truth: bool = False) -> Traced:
-        """The result of an operation.
+        """Record an operation and return its result.
 
         Args:
             text: expression of the operation, with ``{}`` for each operand.
-            of: numbers of the operations whose results are the operands.
-            truth: whether the result is true or false.
+            of: numbers of the operations that compute the operands.
+            truth: True if the result is a truth value.
         """
         at = self._operations.setdefault((text, of), len(self._operations))
         return Traced(self, at, truth)
 
     def operation(
-        self, text: str, given: tuple[Any, ...], *, of_truths: int = 0, truth: bool = False
+        self, text: str, operands: tuple[Any, ...], *, of_truths: int = 0, truth: bool = False
     ) -> Traced:
-        """The result of an operation on quantities and constants.
+        """Record an operation on quantities and constants, and return its result.
 
         Args:
             text: expression of the operation, with ``{}`` for each operand.
-            given: operands.
-            of_truths: how many of the first operands are true or false.
-            truth: whether the result is true or false.
+            operands: quantities and constants.
+            of_truths: number of leading operands that must be truth values.
+            truth: True if the result is a truth value.
 
         Raises:
-            TypeError: numbers where truth values belong, or the other way round.
+            TypeError: if an operand is a number instead of a truth value, or the reverse.
         """
-        quantities = [self.lift(x) for x in given]
-        if [x.truth for x in quantities] != [i < of_truths for i in range(len(given))]:
+        quantities = [self.lift(x) for x in operands]
+        if [x.truth for x in quantities] != [i < of_truths for i in range(len(operands))]:
             raise TypeError(f"{text}: truth values cannot be mixed with numbers; use np.where")
         return self.entry(text, of=tuple(x.at for x in quantities), truth=truth)
 
     def lift(self, value: Any) -> Traced:
-        """The quantity of a number or of an array (n,) that is constant.
+        """Return the traced quantity of a number or of a constant array (n,).
 
         Raises:
-            TypeError: an array of another shape, or a number that is not finite.
+            TypeError: if an array has another shape, or a number is not finite.
         """
         if isinstance(value, Traced):
             return value
@@ -198,7 +199,7 @@ class Trace:
         if array.ndim == 0:
             if array.dtype == np.bool_ or not np.isfinite(array):
                 raise TypeError(f"{value}: only finite numbers can be compiled")
-            # Literals without a type would be rounded to f32.
+            # A literal without a type would be rounded to f32.
             return self.entry(f"zeros + ti.f64({float(array)!r})")
         if array.shape != (self.size,):
             raise TypeError(f"constant of shape {array.shape}, expected ({self.size},)")
@@ -214,9 +215,10 @@ class Trace:
         return read > 0.5 if array.dtype == np.bool_ else read
 
     def statements(self, results: list[Traced]) -> list[str]:
-        """Statements that compute the results and store them, without what none of them needs.
+        """Return statements that compute and store the results, without unneeded operations.
 
-        What is used once stands where it is used, since Taichi is slow at statements.
+        A quantity that is used once is inserted into its user, because Taichi translates statements
+        slowly.
         """
         known = list(self._operations)
         needed: set[int] = set()
@@ -241,7 +243,7 @@ class Trace:
 
 
 def _power(base: Traced, exponent: Any) -> Traced:
-    """Power of a whole exponent, as products."""
+    """Return a power with a whole exponent, as a product."""
     if isinstance(exponent, Traced) or np.ndim(exponent) or float(exponent) % 1.0 or not exponent:
         raise TypeError(f"power {exponent}: only whole numbers other than 0 can be compiled")
     out = base
@@ -251,7 +253,7 @@ def _power(base: Traced, exponent: Any) -> Traced:
 
 
 def _rint(x: Traced) -> Traced:
-    """The nearest whole number, the even one of two, as NumPy has it."""
+    """Round to the nearest whole number, and halves to the even one, like NumPy."""
     up = np.floor(x + 0.5)
     tie = (up - x == 0.5) & (up - 2.0 * np.floor(0.5 * up) == 1.0)
     rounded: Traced = np.where(tie, up - 1.0, up)
@@ -261,23 +263,23 @@ def _rint(x: Traced) -> Traced:
 Arrays = Mapping[str, Any]
 
 SERIAL_UP_TO = 4096
-"""Entries that one thread computes sooner than several are woken."""
+"""Largest number of entries that one thread computes faster than several threads."""
 COPIED_UP_TO = 1024
-"""Entries whose results are copied sooner than the kernel is handed another array for them."""
+"""Largest number of entries for which copying the results is faster than passing a new array."""
 _TASK_BLOCKS = 32
-"""Vectors that one task computes."""
+"""Vectors per task."""
 
 
 class CompiledStage:
     """A stage function that runs as one kernel.
 
     Args:
-        stage: function of arrays (n,), and of objects with arrays (n,) as attributes, by name. It
-            returns arrays (n,), or numbers, by name. It may use arithmetic, comparisons and the
-            NumPy functions that ``_NUMBERS`` lists, but no branch on values. It never changes its
-            arguments, and infinities and NaN are no numbers here. Which attributes it reads is
-            found when it is compiled, so later calls need no others.
-        size: n.
+        stage: function with named arguments: arrays (n,), or objects with arrays (n,) as
+            attributes. It returns a mapping of names to arrays (n,) or numbers. It may use
+            arithmetic, comparisons and the NumPy functions in ``_NUMBERS``. It must not branch on
+            values or change its arguments, and it must not use infinities or NaN. Compilation
+            determines the attributes that it reads; later calls need no others.
+        size: number of entries n.
     """
 
     def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
@@ -286,28 +288,28 @@ class CompiledStage:
         self._kernel: BoundKernel | None = None
 
     def __call__(self, **inputs: Any) -> dict[str, npt.NDArray[np.float64]]:
-        """Results by name, each (n,): rows of one new array.
+        """Compute the results by name, each (n,), as rows of one new array.
 
         Raises:
-            TypeError: the stage does what cannot be compiled, or arguments are not those of the
-                first call.
+            TypeError: if the stage contains an operation that cannot be compiled, or the argument
+                names differ from those of the first call.
         """
         self._set_inputs(inputs)
         return self._new_results()
 
     def rows(self, **inputs: Any) -> npt.NDArray[np.float64]:
-        """Results in their order, (number of results, n); the next call overwrites them.
+        """Compute the results as rows in their order, (results, n); the next call overwrites them.
 
         Raises:
-            TypeError: the stage does what cannot be compiled, or arguments are not those of the
-                first call.
+            TypeError: if the stage contains an operation that cannot be compiled, or the argument
+                names differ from those of the first call.
         """
         self._set_inputs(inputs)
         self._run(self._outputs)
         return self._results
 
     def _set_inputs(self, inputs: Arrays) -> None:
-        """Copy arguments, of the names of the first call, to the rows of the kernel."""
+        """Copy arguments to the input rows; their names must be those of the first call."""
         if self._kernel is None:
             self._compile(inputs)
         elif tuple(inputs) != self._names:
@@ -321,7 +323,7 @@ class CompiledStage:
             row[...] = value
 
     def _new_results(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Run; results by name, rows of one new array."""
+        """Run the kernel and return the results by name, as rows of one new array."""
         if self._size <= COPIED_UP_TO:
             self._run(self._outputs)
             rows = self._results.copy()
@@ -343,7 +345,7 @@ class CompiledStage:
         results = {name: trace.lift(x) for name, x in self._stage(**traced).items()}
         self._names, self._result_names = tuple(inputs), tuple(results)
         self._readers = []
-        """For each argument what returns its arrays; empty if all arguments are arrays."""
+        """Functions that return the arrays of each argument; empty if all arguments are arrays."""
         if any(isinstance(x, TracedObject) for x in traced.values()):
             self._readers = [_reader(x) for x in traced.values()]
         self._shared = np.array([*trace.shared, 0.0])
@@ -359,13 +361,13 @@ class CompiledStage:
         self._results: npt.NDArray[np.float64] = unpadded(self._outputs, self._size)
         source = _source(trace.statements(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
-        # A function that is a method of the stage's owner would make a cycle of references, which
-        # only the garbage collector frees, with all arrays that the object holds.
+        # If the stage is a method of the owner of this object, keeping it would create a reference
+        # cycle. Only the garbage collector frees a cycle, with all arrays that the object holds.
         self._stage = None
 
 
 def _reader(argument: Any) -> Callable[[Any], Iterable[Any]]:
-    """What returns those arrays of an argument that the stage reads, in the order of its rows."""
+    """Return a function that yields the arrays of an argument that the stage reads, in order."""
     if not isinstance(argument, TracedObject):
         return lambda array: (array,)
     names = [*argument.read]
@@ -375,10 +377,10 @@ def _reader(argument: Any) -> Callable[[Any], Iterable[Any]]:
 
 
 def _source(body: list[str]) -> str:
-    """Source of a kernel that does these statements for every vector i.
+    """Return the source of a kernel that executes these statements for every vector i.
 
-    The step of the innermost loop is an argument that is always 1: compilers that knew it would
-    make copies of the body, for two thirds of the machine code of a short one, and nothing gained.
+    The step of the innermost loop is an argument that is always 1. With a known step, compilers
+    would unroll the loop, which adds two thirds to the machine code of a short body without gain.
     """
     head = (
         "@ti.kernel\n"
@@ -405,7 +407,7 @@ def _minus(a):
 
 @cache
 def _kernel(source: str) -> Any:
-    """The Taichi kernel of a source, one for all fleets whose stages are the same."""
+    """Return the Taichi kernel of a source text; fleets with equal stages share one kernel."""
     scope = {
         "ti": ti,
         "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
