@@ -1,8 +1,9 @@
-"""Actions, state and results of a step, and the array types of the package.
+"""Actions, state and results of a simulation step, and the array types of the package.
 
-In shapes, B counts data centers, U CRAC units, R racks, G server groups and S servers, those of all
-data centers end to end. Dataclasses that every step makes are not frozen, since a frozen one takes
-three times as long to make.
+In shapes, B is the number of data centers. U, R, G and S are the numbers of CRAC units, racks,
+server groups and servers of all data centers together, concatenated in the order of the data
+centers. Dataclasses that are created in every step are not frozen, because creating a frozen one
+takes three times as long.
 """
 
 from __future__ import annotations
@@ -24,30 +25,30 @@ import numpy.typing as npt
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Values = F64 | float
-"""An array, or one number for all of its entries."""
+"""An array, or a scalar that stands for an array of equal entries."""
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Status = npt.NDArray[np.int8]
-"""Status of racks, see ``hall.protection``."""
+"""Status codes of racks as defined in ``hall.protection``: 0 normal, 1 throttled, 2 tripped."""
 Reals = npt.NDArray[np.floating[Any]]
-"""Real numbers in the precision of the server kernels."""
+"""Array of f32 or f64 numbers, in the precision of the server kernels."""
 
 
 def as_array(values: F64 | float) -> F64:
-    """An array of what may be a number; quantities of a compiled stage stay what they are."""
+    """Convert a float to an array; return arrays and traced quantities of a stage unchanged."""
     return np.asarray(values) if isinstance(values, float) else values
 
 
 def fields_of(values: Any) -> dict[str, Any]:
-    """Fields of a dataclass by name."""
+    """Return the fields of a dataclass instance as a dict by name."""
     return {f.name: getattr(values, f.name) for f in fields(values)}
 
 
 def joined(*parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of all parts by name, each of which one part alone may have.
+    """Merge mappings whose names must not overlap.
 
     Raises:
-        ValueError: A name that two parts have.
+        ValueError: Two parts contain the same name.
     """
     values: dict[str, Any] = {}
     for part in parts:
@@ -60,7 +61,7 @@ def joined(*parts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class LoadAction(Enum):
-    """Commands for delay-tolerant work; the values are commands in -1..1."""
+    """Commands for delay-tolerant work; each value is the equivalent continuous command, -1..1."""
 
     DEFER = -1
     NEUTRAL = 0
@@ -68,7 +69,7 @@ class LoadAction(Enum):
 
 
 class CoolAction(Enum):
-    """How to move the CRAC setpoint, in steps of ``hvac.setpoint.step_k``."""
+    """Changes of the CRAC setpoint, in steps of ``hvac.setpoint.step_k``."""
 
     LOWER = -1
     HOLD = 0
@@ -76,7 +77,7 @@ class CoolAction(Enum):
 
 
 class FanAction(Enum):
-    """How to move the CRAC fan speed, in steps of ``hvac.crac.fan_step``."""
+    """Changes of the CRAC fan speed, in steps of ``hvac.crac.fan_step``."""
 
     LOWER = -1
     HOLD = 0
@@ -84,7 +85,7 @@ class FanAction(Enum):
 
 
 class BatteryAction(Enum):
-    """Commands of the battery, as shares of its power limit."""
+    """Battery commands, as shares of the battery's power limit."""
 
     DISCHARGE = -1
     IDLE = 0
@@ -95,96 +96,101 @@ class BatteryAction(Enum):
 class Actions:
     """Commands of one step.
 
-    A command is an enum or a number for all data centers, or a list or an array with one entry for
-    each of them. Numbers are continuous commands.
+    A single enum member or number applies to all data centers; a list or array has one entry per
+    data center. Numbers are continuous commands.
     """
 
     load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
-    """Share of what can be deferred (below 0) or drained (above 0), -1..1, () or (B,)."""
+    """Share of the deferrable work to defer (below 0) or of the queue to drain (above 0), -1..1,
+    shape () or (B,)."""
     cooling: CoolAction | float | F64 | Sequence[CoolAction] | None = None
-    """Steps of ``hvac.setpoint.step_k`` by which setpoints move, a number within -1e6..1e6, (),
-    (B,) or (U,); None follows ``hvac.setpoint.schedule_c``, and holds where there is none."""
+    """Change of the setpoints in steps of ``hvac.setpoint.step_k``, -1e6..1e6, shape (), (B,) or
+    (U,); None follows ``hvac.setpoint.schedule_c``, or holds the setpoint without a schedule."""
     battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
-    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, () or (B,)."""
+    """Share of the battery's power limit to discharge (below 0) or charge (above 0), -1..1,
+    shape () or (B,)."""
     fan: FanAction | float | F64 | Sequence[FanAction] = FanAction.HOLD
-    """Steps of ``hvac.crac.fan_step`` by which CRAC fan speeds move, a number within -1e6..1e6, (),
-    (B,) or (U,); for flow model ``controlled`` alone."""
+    """Change of the CRAC fan speeds in steps of ``hvac.crac.fan_step``, -1e6..1e6, shape (), (B,)
+    or (U,); only flow model ``controlled`` accepts a change."""
     placement: F64 | None = None
-    """Relative load of each rack, (R,), or server group, (G,); None loads all alike; for policy
-    ``weights`` alone."""
+    """Relative load of each rack, (R,), or server group, (G,); None weighs all equally. Only
+    placement policy ``weights`` accepts it."""
 
 
 @dataclass(slots=True)
 class State:
-    """Values that are carried from step to step; everything else derives from them.
+    """State of the simulation between two steps, from which all other quantities derive.
 
-    Arrays that the models in use do not need are empty.
+    Arrays that the configured models do not need are empty.
     """
 
     step: int
-    """Steps done since reset."""
+    """Number of steps simulated since reset."""
     seed: I64
     """Seed of the sampled events of each data center, (B,)."""
     start: I64
-    """Index of the first step in the year, (B,)."""
+    """First step of the run, counted from the beginning of the year, (B,)."""
     setpoint_c: F64
     """Setpoint of each CRAC unit, in C, (U,)."""
     cooling_run: I64
-    """Equal cooling commands in a row that each CRAC unit has had, (U,)."""
+    """Number of consecutive equal cooling commands that each CRAC unit has received, (U,)."""
     cooling_last: F64
     """Last cooling command of each CRAC unit, in steps, nan before the first, (U,)."""
     fan_speed: F64
-    """Controlled speed of each CRAC fan over full speed, 0..1, (U,)."""
+    """Controlled speed of each CRAC fan as a share of full speed, 0..1, (U,)."""
     queue: F64
-    """Tasks in the queue by the step that put them in, oldest first, accumulated, (B, L) with L
-    the steps that a queue tells apart; read-only."""
+    """Cumulative sum of the queued tasks by the step in which they arrived, oldest step first,
+    shape (B, L) with L the number of arrival steps that a queue distinguishes; read-only."""
     stored_kwh: F64
     """Energy in the battery, in kWh, (B,)."""
     room_heat_kwh: F64
-    """Heat held by the room over that at the setpoint, in kWh, below 0 while its air is colder,
-    (B,)."""
+    """Heat stored in the room relative to the room at the setpoint, in kWh, (B,); negative while
+    the air is colder than the setpoint."""
     rack_status: Status
     """Status of each rack: 0 normal, 1 throttled, 2 tripped, (R,)."""
     restart_wait_min: F64
-    """Time for which each tripped rack has been able to restart, in min, (R,); where racks protect
-    themselves."""
+    """Time for which each tripped rack has been able to restart, in min, (R,); empty if no rack
+    protects itself."""
     group_inlet_c: F64
-    """Inlet of each server group in the last step, in C, (G,); for placement by temperature."""
+    """Inlet temperature of each server group in the last step, in C, (G,); filled only for
+    placement policies that read temperatures."""
     server_c: Reals
-    """Temperature of the servers of each group, in C, (G,); for transient halls."""
+    """Temperature of the servers of each group, in C, (G,); only in transient halls."""
     mixed_c: Reals
-    """Temperature of the recirculated air before each rack, in C, (R,); for transient halls."""
-    exhaust_c: Reals
-    """Outlet temperature of each rack times the strength of its exhaust, in C, (R,); for transient
+    """Temperature of the recirculated air before each rack, in C, (R,); only in transient
     halls."""
+    exhaust_c: Reals
+    """Outlet temperature of each rack multiplied by its weight (strength) in the exhaust mixes, in
+    C, (R,); only in transient halls."""
     captured_m3s: Reals
-    """Recirculated air that each rack takes in, in m3/s, (R,); for transient halls."""
+    """Recirculated air that each rack draws in, in m3/s, (R,); only in transient halls."""
     need_m3s: F64
-    """Supply air that the racks ask of each CRAC unit, in m3/s, (U,); for transient halls."""
+    """Supply airflow that the racks demand from each CRAC unit, in m3/s, (U,); only in transient
+    halls."""
     following: F64
-    """Fan speed of each CRAC unit over full speed that would just cover the need, (U,); for
-    transient halls."""
+    """Fan speed at which each CRAC unit would just meet ``need_m3s``, as a share of full speed,
+    (U,); only in transient halls."""
     supply_excess_k: F64
-    """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,);
-    for transient halls."""
+    """Supply temperature of each CRAC unit minus its setpoint and minus the warming of the room by
+    stored heat, in K, (U,); only in transient halls."""
 
 
 DATA_CENTERS, CRAC_UNITS, RACKS = "B", "U", "R"
-"""Axes of quantities: an entry per data center, CRAC unit or rack."""
+"""Axis of a quantity: one entry per data center (B), CRAC unit (U) or rack (R)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Unit and axis of a quantity of a step, with which its field is annotated.
+    """Unit and array axis of a result quantity, as an annotation of its field.
 
-    The annotated fields of ``StepResult`` are the one table of quantities: columns of run folders,
-    their documentation and labels are derived from it (``QUANTITIES``, ``meanings``).
+    The annotated fields of ``StepResult`` are the only table of quantities. The columns of run
+    folders, their documentation and their labels derive from it (``QUANTITIES``, ``meanings``).
     """
 
     unit: str
-    """Unit; "1" for shares and ratios, "" for counts and numbers of things."""
+    """Unit; "1" for shares and ratios, "" for counts, indices and status codes."""
     axis: str = DATA_CENTERS
-    """What the array has an entry for, along its only axis."""
+    """Kind of element along the array's single axis: data centers, CRAC units or racks."""
 
 
 @dataclass
@@ -192,29 +198,29 @@ class Exogenous:
     """Weather, grid and demand during one step of B data centers."""
 
     outdoor_c: Annotated[F64, Quantity("C")]
-    """Dry-bulb temperature outside."""
+    """Outdoor dry-bulb temperature."""
     wet_bulb_c: Annotated[F64, Quantity("C")]
-    """Wet-bulb temperature outside."""
+    """Outdoor wet-bulb temperature."""
     ci_g_per_kwh: Annotated[F64, Quantity("g CO2e/kWh")]
     """Carbon intensity of the grid."""
     demand: Annotated[F64, Quantity("1")]
-    """Work that arrives as a share of capacity, 0..1."""
+    """Arriving work as a share of the data center's capacity, 0..1."""
     price_per_kwh: Annotated[F64, Quantity("currency/kWh")]
-    """Price of a kWh from the grid, in the currency of the tariff; 0 without prices."""
+    """Price of a kWh from the grid, in the currency of the tariff; 0 without a tariff."""
 
 
 @dataclass
 class SiteQuantities(Exogenous):
-    """Conditions of one step on site, with the effects of events."""
+    """Site conditions of one step, with the effects of events."""
 
     active_events: Annotated[F64, Quantity("")]
     """Number of events that cover the step."""
     grid_up: Annotated[F64, Quantity("1")]
-    """1 with grid, 0 in an outage."""
+    """1 if the grid supplies power, 0 in an outage."""
     powered: Annotated[F64, Quantity("1")]
-    """Share of the step that the data center has power, 0..1."""
+    """Share of the step during which the data center has power, 0..1."""
     unit_running: Annotated[F64, Quantity("1", CRAC_UNITS)]
-    """1 for CRAC units that run, 0 for those that are down or without power."""
+    """1 for running CRAC units, 0 for units that are down or without power."""
 
 
 @dataclass
@@ -222,12 +228,14 @@ class CommandQuantities:
     """Commands of one step."""
 
     load_command: Annotated[F64, Quantity("1")]
-    """Share of what could be deferred (below 0) or drained (above 0), -1..1."""
+    """Commanded share of the deferrable work to defer (below 0) or of the queue to drain (above
+    0), -1..1."""
     cooling_command: Annotated[F64, Quantity("")]
-    """Setpoint steps that were commanded, mean over the CRAC units; 0 where setpoints follow their
-    schedule."""
+    """Commanded change of the setpoint, in setpoint steps, mean over the CRAC units; 0 where
+    setpoints follow their schedule."""
     battery_command: Annotated[F64, Quantity("1")]
-    """Share of the battery's power limit, discharged (below 0) or charged, -1..1."""
+    """Commanded share of the battery's power limit to discharge (below 0) or charge (above 0),
+    -1..1."""
 
 
 @dataclass
@@ -235,7 +243,7 @@ class WorkQuantities:
     """Work that arrives, starts, waits and leaves in one step."""
 
     utilisation: Annotated[F64, Quantity("1")]
-    """Work that was started, as a share of capacity, including ``lost_tasks``."""
+    """Started work as a share of capacity, including ``lost_tasks``."""
     arrived_tasks: Annotated[F64, Quantity("tasks")]
     """Work that arrived."""
     deferred_tasks: Annotated[F64, Quantity("tasks")]
@@ -243,22 +251,22 @@ class WorkQuantities:
     drained_tasks: Annotated[F64, Quantity("tasks")]
     """Work that left the queue on command."""
     due_tasks: Annotated[F64, Quantity("tasks")]
-    """Queued work whose deadline had come at the start of the step."""
+    """Queued work whose deadline has passed at the start of the step."""
     overdue_tasks: Annotated[F64, Quantity("tasks")]
-    """Due work that did not fit into the step."""
+    """Due work that exceeds the capacity of the step and stays in the queue."""
     dropped_tasks: Annotated[F64, Quantity("tasks")]
-    """Work that found the queue full; with model ``tasks`` it runs at once, as part of
-    ``executed_tasks``."""
+    """Work that could not be deferred because the queue was full; with workload model ``tasks`` it
+    runs at once and counts in ``executed_tasks``."""
 
 
 @dataclass
 class Work(WorkQuantities):
-    """Work of one step of B data centers as a workload model decides on it."""
+    """Decision of a workload model on the work of B data centers in one step."""
 
     started_tasks: F64
     """Work that starts, in tasks, (B,)."""
     dequeued_tasks: F64
-    """Work that leaves the queue, drained or due, in tasks, (B,)."""
+    """Work that leaves the queue because it is drained or due, in tasks, (B,)."""
 
 
 @dataclass
@@ -285,21 +293,21 @@ class SetpointQuantities:
 
 @dataclass
 class HallQuantities:
-    """Air and servers of the halls in one step."""
+    """Air temperatures, airflows and server power of the halls in one step."""
 
     supply_c: Annotated[F64, Quantity("C")]
-    """Supply air temperature, mean over the CRAC airflow: the setpoint plus the warming of the
-    room by unmet cooling."""
+    """Supply air temperature, airflow-weighted mean over the CRAC units: the setpoint plus the
+    warming by unmet cooling."""
     inlet_mean_c: Annotated[F64, Quantity("C")]
-    """Mean over the racks of their inlet temperatures."""
+    """Mean inlet temperature of the racks."""
     inlet_max_c: Annotated[F64, Quantity("C")]
-    """Hottest inlet of a server, in transient halls of any substep."""
+    """Highest server inlet temperature; in transient halls the maximum over the substeps."""
     hottest_rack: Annotated[F64, Quantity("")]
-    """Rack with the hottest inlet, counted from 0 in its data center."""
+    """Index of the rack with the hottest inlet, counted from 0 in its data center."""
     hottest_server: Annotated[F64, Quantity("")]
-    """Server with the hottest inlet, counted from 0 at the floor of its rack."""
+    """Index of the server with the hottest inlet, counted from 0 at the floor of its rack."""
     outlet_mean_c: Annotated[F64, Quantity("C")]
-    """Mean over the racks of their outlet temperatures."""
+    """Mean outlet temperature of the racks."""
     cpu_w: Annotated[F64, Quantity("W")]
     """Power of the servers without their fans."""
     it_fan_w: Annotated[F64, Quantity("W")]
@@ -307,7 +315,7 @@ class HallQuantities:
     it_airflow_m3s: Annotated[F64, Quantity("m3/s")]
     """Airflow through the servers."""
     thermal_storage_w: Annotated[F64, Quantity("W")]
-    """Heat that goes into servers and recirculated air in transient halls."""
+    """Rate at which servers and recirculated air store heat; only in transient halls."""
     unit_supply_c: Annotated[F64, Quantity("C", CRAC_UNITS)]
     """Supply air temperature of each CRAC unit."""
     rack_cpu_w: Annotated[Reals, Quantity("W", RACKS)]
@@ -317,18 +325,21 @@ class HallQuantities:
     rack_airflow_m3s: Annotated[Reals, Quantity("m3/s", RACKS)]
     """Airflow through each rack."""
     rack_inlet_c: Annotated[Reals, Quantity("C", RACKS)]
-    """Inlet of each rack, mean over its servers, weighted by airflow where air recirculates."""
+    """Inlet temperature of each rack, mean over its servers; weighted by airflow with inlet model
+    ``recirculation``."""
     rack_inlet_max_c: Annotated[Reals, Quantity("C", RACKS)]
-    """Hottest inlet of a server of each rack, in transient halls of any substep."""
+    """Highest server inlet temperature of each rack; in transient halls the maximum over the
+    substeps."""
     rack_outlet_c: Annotated[Reals, Quantity("C", RACKS)]
-    """Outlet of each rack."""
+    """Outlet temperature of each rack."""
     rack_outlet_max_c: Annotated[Reals, Quantity("C", RACKS)]
-    """Hottest outlet of a server of each rack, in transient halls of any substep."""
+    """Highest server outlet temperature of each rack; in transient halls the maximum over the
+    substeps."""
 
 
 @dataclass
 class CracQuantities:
-    """Air that the CRAC units of B data centers move, and heat that they take, in one step."""
+    """Airflow, fan power and heat load of the CRAC units of B data centers in one step."""
 
     crac_flow_m3s: Annotated[F64, Quantity("m3/s")]
     """Airflow of the CRAC units."""
@@ -337,50 +348,53 @@ class CracQuantities:
     return_c: Annotated[F64, Quantity("C")]
     """Temperature of the air that returns to the CRAC units."""
     cooling_load_w: Annotated[F64, Quantity("W")]
-    """Heat that the CRAC units are to take from the room."""
+    """Heat that the CRAC units have to remove from the room."""
 
 
 @dataclass
 class AirIndices:
-    """Indices of how well the air of the halls is managed in one step."""
+    """Air-management indices of the halls in one step."""
 
     over_27_mean_k: Annotated[F64, Quantity("K")]
-    """Inlet temperature in excess of 27 C, mean over the servers; times hours, degree-hours."""
+    """Excess of the inlet temperature above 27 C, mean over the servers; multiplied by hours it
+    gives degree-hours."""
     shi: Annotated[F64, Quantity("1")]
-    """Supply heat index, 0 when all inlets get supply air; see ``hall.air_metrics``."""
+    """Supply heat index (SHI), 0 if every inlet receives pure supply air; see
+    ``hall.air_metrics``."""
     rti_pct: Annotated[F64, Quantity("%")]
-    """Return temperature index, above 100 where air recirculates on balance."""
+    """Return temperature index (RTI); above 100 % recirculation exceeds bypass, below 100 % bypass
+    exceeds recirculation."""
     rci_hi_pct: Annotated[F64, Quantity("%")]
-    """Rack cooling index at the high end, 100 without an inlet above 27 C."""
+    """Rack cooling index at the high end (RCI HI), 100 if no inlet is above 27 C."""
     rci_lo_pct: Annotated[F64, Quantity("%")]
-    """Rack cooling index at the low end, 100 without an inlet below 18 C."""
+    """Rack cooling index at the low end (RCI LO), 100 if no inlet is below 18 C."""
 
 
 @dataclass
 class PlantQuantities:
-    """Heat, water temperatures and power of the plants in one step."""
+    """Heat flows, water temperatures and power of the cooling plants in one step."""
 
     heat_removed_w: Annotated[F64, Quantity("W")]
-    """Heat that the plant takes from the CRAC units."""
+    """Heat that the cooling plant removes from the CRAC units."""
     economiser_w: Annotated[F64, Quantity("W")]
-    """Heat that economiser, dry cooler or outdoor air takes past the chiller."""
+    """Heat that the economiser, the dry cooler or outdoor air removes without the chiller."""
     chiller_load_w: Annotated[F64, Quantity("W")]
-    """Heat that the chiller takes off the chilled water."""
+    """Heat that the chiller removes from the chilled water."""
     chiller_w: Annotated[F64, Quantity("W")]
     """Electric power of the chiller."""
     rejected_w: Annotated[F64, Quantity("W")]
-    """Heat that goes to the outside."""
+    """Heat rejected to the outdoors."""
     chilled_water_c: Annotated[F64, Quantity("C")]
     """Temperature of the chilled water supply."""
     condenser_water_c: Annotated[F64, Quantity("C")]
-    """Temperature of the water that leaves the tower, or of the outdoor air that cools the
-    condenser."""
+    """Temperature of the water leaving the cooling tower, or of the outdoor air that cools an
+    air-cooled condenser."""
     tower_fan_w: Annotated[F64, Quantity("W")]
-    """Electric power of the fans of tower, dry cooler or outdoor air."""
+    """Electric power of the fans of the cooling tower, the dry cooler or the outdoor air intake."""
     chilled_pump_w: Annotated[F64, Quantity("W")]
     """Electric power of the chilled-water pumps."""
     condenser_pump_w: Annotated[F64, Quantity("W")]
-    """Electric power of the pumps of condenser water, or of the dry cooler's loop."""
+    """Electric power of the condenser-water pumps, or of the pumps of the dry cooler's loop."""
 
 
 @dataclass
@@ -407,33 +421,33 @@ class WaterSideResult(PlantQuantities):
 
 @dataclass
 class RoomQuantities:
-    """Heat that the plants leave in the room or fetch from it in one step."""
+    """Heat that stays in the room, or is recovered from it, in one step."""
 
     unmet_w: Annotated[F64, Quantity("W")]
-    """Cooling load that is not removed and stays in the room."""
+    """Part of the cooling load that is not removed and stays in the room."""
     recovered_w: Annotated[F64, Quantity("W")]
-    """Heat held by the room earlier that spare capacity removes."""
+    """Heat stored in the room by earlier steps that spare cooling capacity removes."""
     room_heat_kwh: Annotated[F64, Quantity("kWh")]
-    """Heat held by the room at the end of the step, relative to that at the setpoint."""
+    """Heat stored in the room at the end of the step, relative to the room at the setpoint."""
 
 
 @dataclass
 class WaterQuantities:
-    """Water of towers and humidifiers in one step."""
+    """Water consumption of cooling towers and humidifiers in one step."""
 
     evaporation_l: Annotated[F64, Quantity("l")]
-    """Water that tower, or humidifier of outdoor air, evaporates."""
+    """Water evaporated by the cooling tower, or by the humidifier of the outdoor air."""
     drift_l: Annotated[F64, Quantity("l")]
-    """Water that leaves the tower as drops."""
+    """Water that leaves the cooling tower as droplets."""
     blowdown_l: Annotated[F64, Quantity("l")]
-    """Water that is drained so that salt does not concentrate."""
+    """Water drained to limit the concentration of salts."""
     water_l: Annotated[F64, Quantity("l")]
-    """Make-up water."""
+    """Make-up water: evaporation, drift and blowdown."""
 
 
 @dataclass
 class BatteryQuantities:
-    """Batteries in one step."""
+    """Battery quantities of one step."""
 
     stored_kwh: Annotated[F64, Quantity("kWh")]
     """Energy in the battery at the end of the step."""
@@ -442,7 +456,7 @@ class BatteryQuantities:
     discharge_kwh: Annotated[F64, Quantity("kWh")]
     """Energy delivered by the battery."""
     battery_loss_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy that the battery loses."""
+    """Energy lost in the battery."""
 
 
 @dataclass
@@ -458,16 +472,16 @@ class EnergyQuantities:
     """Power, energy, emissions and cost of B data centers in one step."""
 
     it_w: Annotated[F64, Quantity("W")]
-    """IT power, servers with their fans."""
+    """IT power: servers including their fans."""
     hvac_w: Annotated[F64, Quantity("W")]
-    """Electric power of the devices that ``hvac.total_of`` names."""
+    """Electric power of the HVAC devices that ``hvac.total_of`` lists."""
     ups_loss_w: Annotated[F64, Quantity("W")]
-    """Power that the UPS loses."""
+    """Power lost in the UPS."""
     distribution_loss_w: Annotated[F64, Quantity("W")]
-    """Power that transformers, PDUs and wiring lose behind the UPS."""
+    """Power lost in transformers, PDUs and wiring downstream of the UPS."""
     overhead_w: Annotated[F64, Quantity("W")]
-    """Power of the facility besides IT that the energy bought covers: ``hvac_w``, and with
-    ``electrical.losses: counted`` the losses of UPS and distribution."""
+    """Facility power in addition to IT: ``hvac_w``, and with ``electrical.losses: counted`` also
+    the losses of UPS and distribution."""
     soc: Annotated[F64, Quantity("1")]
     """State of charge of the battery at the end of the step, 0..1."""
     it_kwh: Annotated[F64, Quantity("kWh")]
@@ -477,28 +491,28 @@ class EnergyQuantities:
     grid_kwh: Annotated[F64, Quantity("kWh")]
     """Energy bought from the grid."""
     grid_overload_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy bought beyond what the grid connection carries; part of ``grid_kwh``."""
+    """Energy bought above the limit of the grid connection; part of ``grid_kwh``."""
     unserved_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy that facility and battery lack in an outage while there is power (see
-    ``powered``)."""
+    """Energy demand that neither grid nor battery covers in an outage, during the powered part of
+    the step (see ``powered``)."""
     carbon_g: Annotated[F64, Quantity("g CO2e")]
-    """Emissions of the energy bought."""
+    """Emissions of the energy bought from the grid."""
     energy_cost: Annotated[F64, Quantity("currency")]
-    """Price of the energy bought, without demand charges, in the currency of the tariff."""
+    """Cost of the energy bought, without demand charges, in the currency of the tariff."""
 
 
 @dataclass
 class RackQuantities:
-    """Status of the racks at the end of a step, and the work that they did and lost."""
+    """Status of the racks at the end of a step, and their executed and lost work."""
 
     executed_tasks: Annotated[F64, Quantity("tasks")]
-    """Work that was done."""
+    """Work completed in the step."""
     lost_tasks: Annotated[F64, Quantity("tasks")]
-    """Work that had been started and found no server or went down with it."""
+    """Started work that found no server, or was lost when its rack tripped."""
     throttled_racks: Annotated[F64, Quantity("racks")]
-    """Racks that are throttled at the end of the step."""
+    """Number of throttled racks at the end of the step."""
     tripped_racks: Annotated[F64, Quantity("racks")]
-    """Racks that have tripped and are off at the end of the step."""
+    """Number of tripped racks, which are off, at the end of the step."""
     rack_status: Annotated[Status, Quantity("", RACKS)]
     """Status of each rack at the end of the step: 0 normal, 1 throttled, 2 tripped."""
 
@@ -522,12 +536,12 @@ class StepResult(
 ):
     """Every quantity of one step.
 
-    Powers are means over the step, energies and volumes are totals. 1 task is 1 % of the capacity
-    of a data center for one step. Arrays of a step are parts of a few larger ones: copy those that
-    are kept for long.
+    Powers are means over the step, energies and volumes are totals of the step. 1 task is the work
+    of 1 % of a data center's capacity during one step. The arrays are views of a few larger
+    buffers: copy an array before storing it for long, or the whole buffer stays in memory.
     """
 
-    # A dataclass takes the fields of its last base first.
+    # The bases are listed in reverse, because a dataclass orders fields from the last base on.
     step: int
     """Index of the step, 0 at reset."""
     step_h: float
@@ -537,27 +551,27 @@ class StepResult(
 
     @property
     def rack_power_w(self) -> Reals:
-        """IT power of each rack, servers with their fans, in W, (R,)."""
+        """IT power of each rack (servers including their fans), in W, (R,)."""
         return self.rack_cpu_w + self.rack_fan_w
 
     @property
     def facility_kwh(self) -> F64:
-        """Energy of IT and ``overhead_w``, without the battery, in kWh, (B,)."""
+        """Energy of IT and of ``overhead_w`` in the step, without the battery, in kWh, (B,)."""
         return self.it_kwh + self.overhead_w * self.step_h / 1e3
 
     @property
     def rhi(self) -> F64:
-        """Return heat index, 1 - SHI, (B,)."""
+        """Return heat index (RHI), 1 - SHI, (B,)."""
         return 1.0 - self.shi
 
     @property
     def pue(self) -> F64:
-        """(IT + overhead) / IT, dimensionless, (B,); inf without IT power."""
-        some = self.it_w > 0
-        return np.where(some, 1.0 + self.overhead_w / np.where(some, self.it_w, 1.0), np.inf)
+        """Power usage effectiveness, (IT + overhead) / IT, (B,); inf without IT power."""
+        has_it = self.it_w > 0
+        return np.where(has_it, 1.0 + self.overhead_w / np.where(has_it, self.it_w, 1.0), np.inf)
 
     def per_dc(self) -> dict[str, F64]:
-        """All (B,) quantities by name, in the order of ``QUANTITIES``."""
+        """Return all quantities of shape (B,) by name, in the order of ``QUANTITIES``."""
         return dict(zip(_PER_DC, _values_per_dc(self), strict=True))
 
 
@@ -573,7 +587,7 @@ _values_per_dc = attrgetter(*_PER_DC)
 
 @cache
 def meanings() -> dict[str, str]:
-    """Meaning of each quantity of ``StepResult`` by name: the docstrings of its fields."""
+    """Return the field docstring of each quantity of ``StepResult`` by name."""
     texts: dict[str, str] = {}
     for part in StepResult.__mro__[-2::-1]:
         (declaration,) = ast.parse(inspect.getsource(part)).body
@@ -587,7 +601,10 @@ def meanings() -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class ServerLayers:
-    """Values of every server in one step; servers follow racks, then groups."""
+    """Temperatures and power of every server in one step.
+
+    Servers are ordered by rack, and within a rack by server group.
+    """
 
     inlet_c: Reals
     """Inlet temperature of each server, in C, (S,)."""

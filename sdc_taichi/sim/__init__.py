@@ -1,5 +1,5 @@
-"""The simulator: configurations become flat arrays, and one step passes through all stages.
+"""The simulator: arrange configurations as flat arrays and run each step through all stages.
 
-Whatever carries state, batches data centers or calls Taichi kernels for them lives here.
-Equations of devices are in ``plant``, files and pictures in ``run`` and ``viz``, never here.
+The package contains all code that carries state, batches data centers or calls Taichi kernels.
+The equations of devices are in ``plant``; files are written by ``run`` and plots by ``viz``.
 """

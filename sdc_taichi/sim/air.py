@@ -1,7 +1,7 @@
-"""Air of the halls during a step: quasi-steady, or with temperatures that take time to change.
+"""Air models of the halls in a step: quasi-steady, or transient with thermal storage.
 
-Both models solve a step from where the work is and how the CRAC units run. What they remember from
-step to step are fields of ``State``.
+Both models solve a step from the placement of the work and the operation of the CRAC units. Their
+memory between steps is a part of ``State``.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _EMPTY = np.zeros(0)
 
 
 class SteadyAir:
-    """Halls whose temperatures follow load and supply air at once.
+    """Quasi-steady halls, whose temperatures follow load and supply air immediately.
 
     Args:
         fleet: B data centers.
         hall: Their halls.
         sizing: Their sized devices.
         units: Their CRAC units.
-        keep_inlets: Whether placement needs the inlets of the last step.
+        keep_inlets: True if the placement policy reads the inlet temperatures of the last step.
     """
 
     def __init__(
@@ -45,30 +45,30 @@ class SteadyAir:
         self._no_memory = dict.fromkeys(_HALL_FIELDS, _EMPTY)
 
     def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
-        """Temperatures before the first step, by their names in ``State``.
+        """Return the temperatures before the first step, by their field names in ``State``.
 
         Args:
-            supply: How the CRAC units run.
-            demand: Work that runs, as a share of capacity, 0..1, (B,).
+            supply: Operation of the CRAC units.
+            demand: Running work as a share of capacity, 0..1, (B,).
         """
         return {**self._no_memory, "group_inlet_c": self._inlets.initial()}
 
     def solve(
         self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
     ) -> tuple[HallSums, dict[str, Any]]:
-        """Air, temperatures and power of a step.
+        """Compute airflows, temperatures and power of a step.
 
         Args:
-            state: State at the start of the step, with the heat held by the room.
-            placement: Where the work is.
-            supply: How the CRAC units run.
-            surroundings: What is out of order.
+            state: State at the start of the step, of which the heat stored in the room is read.
+            placement: Placement of the work.
+            supply: Operation of the CRAC units.
+            surroundings: Failures of the step.
 
         Returns:
-            Sums and means over the step, and temperatures at its end by their names in ``State``.
+            Results of the step, and the temperatures at its end by their field names in ``State``.
 
         Raises:
-            PhysicalLimitError: No steady state, or temperatures or power beyond any number.
+            PhysicalLimitError: There is no steady state, or temperatures or power overflow.
         """
         warmed_k = self._units.of_each(state.room_heat_kwh / self._room_kwh_per_k)
         unit_supply_c = supply.coldest_supply_c + warmed_k
@@ -77,14 +77,15 @@ class SteadyAir:
 
 
 class TransientAir:
-    """Halls whose servers and recirculated air take time to warm and to cool.
+    """Transient halls, whose servers and recirculated air store heat.
 
     Args:
         fleet: B data centers.
         hall: Their halls.
         sizing: Their sized devices.
-        removable_w: Heat that the plant can take during a step, in W, (B,).
-        keep_inlets: Whether placement needs the inlets of the last step.
+        removable_w: Function of surroundings and supply that returns the heat that the plant can
+            remove during a step, in W, (B,).
+        keep_inlets: True if the placement policy reads the inlet temperatures of the last step.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class TransientAir:
         self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
 
     def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
-        """Steady temperatures under the given load; arguments as in ``SteadyAir.initial``."""
+        """Return the steady temperatures at ``demand``; arguments as in ``SteadyAir.initial``."""
         steady = self._hall.steady_state(
             Conditions(
                 unit_supply_c=supply.coldest_supply_c,
@@ -118,10 +119,10 @@ class TransientAir:
     def solve(
         self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
     ) -> tuple[HallSums, dict[str, Any]]:
-        """Air, temperatures and power of a step; arguments and results as in ``SteadyAir.solve``.
+        """Compute a transient step; arguments and results as in ``SteadyAir.solve``.
 
         Raises:
-            PhysicalLimitError: Temperatures or power beyond any number.
+            PhysicalLimitError: Temperatures or power overflow.
         """
         coil = Coil(
             setpoint_c=supply.coldest_supply_c,
@@ -131,7 +132,7 @@ class TransientAir:
             fan_w_per_m3s=self._fan_w_per_m3s * surroundings.powered,
         )
         air, after = self._hall.advance(
-            # The supply air of each substep follows from the coil.
+            # The coil determines the supply temperature of each substep; this one is a start value.
             _conditions(supply.coldest_supply_c, placement, supply, surroundings),
             HallState(**{name: getattr(state, name) for name in _HALL_FIELDS}),
             coil,
@@ -142,13 +143,13 @@ class TransientAir:
 
 
 class _GroupInlets:
-    """Inlets of the server groups in the last step, as far as placement needs them."""
+    """Inlet temperatures of the server groups, computed only if the placement policy reads them."""
 
     def __init__(self, fleet: Fleet, hall: Hall, *, keep: bool) -> None:
         self._fleet, self._hall, self._keep = fleet, hall, keep
 
     def initial(self) -> F64:
-        """Inlets at the initial setpoints, in C, (G,); empty if nothing needs them."""
+        """Return the inlet temperatures at the initial setpoints, in C, (G,); empty if unused."""
         if not self._keep:
             return _EMPTY
         fleet = self._fleet
@@ -157,14 +158,14 @@ class _GroupInlets:
         return np.repeat(inlet_c, np.diff(fleet.group_offsets))
 
     def last(self) -> F64:
-        """Inlets of the last step, in C, (G,); empty if nothing needs them."""
+        """Return the inlet temperatures of the last step, in C, (G,); empty if unused."""
         return self._hall.group_inlets() if self._keep else _EMPTY
 
 
 def _conditions(
     unit_supply_c: F64, placement: Placement, supply: Supply, surroundings: Surroundings
 ) -> Conditions:
-    """Boundary conditions of the halls during a step."""
+    """Collect the boundary conditions of the halls during a step."""
     return Conditions(
         unit_supply_c=unit_supply_c,
         utilisation=placement.utilisation,

@@ -1,4 +1,4 @@
-"""Electricity bills: prices over time, and the highest power of each month."""
+"""Electricity bills: energy prices over time, and the peak power of each month."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from sdc_taichi.types import F64, I64
 
 
 def with_prices(drivers: Drivers, configs: Sequence[DataCenterConfig]) -> Drivers:
-    """Inputs of a fleet with its prices of electricity; given prices stay.
+    """Add the electricity prices of the tariffs to the inputs of a fleet.
+
+    Inputs that already have prices are returned unchanged.
 
     Args:
-        drivers: inputs of B data centers.
-        configs: their configs, B.
+        drivers: Inputs of B data centers.
+        configs: Configs of the B data centers.
     """
     if drivers.price_per_kwh is not None:
         return drivers
@@ -27,26 +29,27 @@ def with_prices(drivers: Drivers, configs: Sequence[DataCenterConfig]) -> Driver
     of_tariff: dict[TariffConfig, F64] = {}
     known: dict[int, F64] = {}
     for tariff in (config.tariff for config in configs):
-        # Copies share the section itself, which is faster to find than an equal one.
+        # Copies of a data center share the tariff object; a look-up by id avoids hashing it.
         if id(tariff) not in known:
             if tariff not in of_tariff:
                 of_tariff[tariff] = np.repeat(tariff.hourly_prices(), per_hour)
             known[id(tariff)] = of_tariff[tariff]
     prices = [known[id(config.tariff)] for config in configs]
-    beside = _beside(drivers.outdoor_c, prices)
-    return replace(drivers, price_per_kwh=fleet_series(prices) if beside is None else beside)
+    aligned = _aligned(drivers.outdoor_c, prices)
+    return replace(drivers, price_per_kwh=fleet_series(prices) if aligned is None else aligned)
 
 
-def _beside(series: FleetSeries, prices: Sequence[F64]) -> FleetSeries | None:
-    """Prices stored at the same places as another series, so that both are read at once.
+def _aligned(series: FleetSeries, prices: Sequence[F64]) -> FleetSeries | None:
+    """Store prices at the same indices as another series, so that both share index arrays.
 
     Args:
-        series: a series of each data center.
-        prices: prices of each data center over a year, (steps of a year,) each, equal ones as the
-            very same array.
+        series: One series per data center.
+        prices: Prices of each data center over a year, one array (steps of a year,) each; equal
+            tariffs must be the same array object.
 
     Returns:
-        None where series are not as long as a year, or data centers share one but not the tariff.
+        The prices; None if the series are not a year long, or if data centers share a series but
+        not a tariff.
     """
     values = np.empty_like(series.values)
     stored: dict[int, F64] = {}
@@ -62,9 +65,9 @@ def _beside(series: FleetSeries, prices: Sequence[F64]) -> FleetSeries | None:
 
 @dataclass(slots=True)
 class BilledDemand:
-    """Highest power of B data centers in the months of a run, as bills count it.
+    """Peak power of B data centers in each month of a run, as demand charges count it.
 
-    A month that a run covers in part counts by the part that it covers.
+    A month that the run covers only in part is weighted by the covered share.
     """
 
     start: I64
@@ -72,26 +75,27 @@ class BilledDemand:
     steps_per_day: int
     """Number of steps in a day."""
     peak_kw: F64
-    """Highest power of the run, mean over a step, in kW, (B,)."""
+    """Largest step-mean power of the run so far, in kW, (B,)."""
     billed_kw_months: F64
-    """Highest power of each month that has ended times the part of it in the run, summed over the
-    months, in kW, (B,)."""
+    """Sum over the completed months of peak power times covered share of the month, in kW,
+    (B,)."""
     month_peak_kw: F64
-    """Highest power of the month under way, in kW, (B,)."""
+    """Peak power of the current month, in kW, (B,)."""
     month_begin: I64
-    """First step of the month under way, counted from the beginning of the run, 0 or less, (B,)."""
+    """First step of the current month, counted from the beginning of the run, (B,); negative if
+    the month began before the run."""
     month_end: I64
     """First step of the next month, counted from the beginning of the run, (B,)."""
     next_end: int
-    """Step in which a month of any data center ends next, counted from the beginning."""
+    """Earliest ``month_end`` of all data centers."""
 
 
 def no_demand(start: I64, steps_per_hour: int) -> BilledDemand:
-    """Demand of no steps.
+    """Return the billed demand before the first step of a run.
 
     Args:
-        start: first step of each data center, counted from the beginning of the year, (B,).
-        steps_per_hour: number of steps in an hour.
+        start: First step of each data center, counted from the beginning of the year, (B,).
+        steps_per_hour: Number of steps in an hour.
     """
     begin, end = month_around(start, 24 * steps_per_hour)
     return BilledDemand(
@@ -107,12 +111,12 @@ def no_demand(start: I64, steps_per_hour: int) -> BilledDemand:
 
 
 def add_power(demand: BilledDemand, step: int, power_kw: F64) -> None:
-    """Add the power of a step, in place.
+    """Add the power of a step to the billed demand, in place.
 
     Args:
-        demand: of the steps before.
-        step: the step, counted from the beginning of the run.
-        power_kw: mean power over the step, in kW, (B,).
+        demand: Billed demand of the previous steps, which is modified.
+        step: Index of the step, counted from the beginning of the run.
+        power_kw: Mean power during the step, in kW, (B,).
     """
     if step >= demand.next_end:
         ended = step >= demand.month_end
@@ -126,11 +130,11 @@ def add_power(demand: BilledDemand, step: int, power_kw: F64) -> None:
 
 
 def billed_kw_months(demand: BilledDemand, steps: int) -> F64:
-    """Highest power of each month times the part of it in the run, over all months, kW, (B,).
+    """Return the sum over all months of peak power times covered share, in kW, (B,).
 
     Args:
-        demand: of the steps of a run.
-        steps: number of these steps.
+        demand: Billed demand of the run.
+        steps: Number of steps of the run.
     """
     covered = steps - np.maximum(demand.month_begin, 0)
     share = covered / (demand.month_end - demand.month_begin)
@@ -138,7 +142,10 @@ def billed_kw_months(demand: BilledDemand, steps: int) -> F64:
 
 
 def month_around(step: I64, steps_per_day: int) -> tuple[I64, I64]:
-    """First step of the month with a step of the year, and of the month after it, (B,) each."""
+    """Return the first steps of the month that contains ``step`` and of the next month.
+
+    All steps are counted from the beginning of the year and have shape (B,).
+    """
     firsts = np.array(FIRST_DAY_OF_MONTH)
     years, day = np.divmod(step // steps_per_day, DAYS_PER_YEAR)
     month = np.searchsorted(firsts, day, side="right") - 1
