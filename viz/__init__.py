@@ -1,5 +1,5 @@
-"""Pictures, HTML reports and Rerun recordings of results.
+"""Pictures, HTML reports and Rerun recordings of simulation results.
 
-Everything here reads what the simulator or a run folder holds, and draws it.
-Nothing here computes physics, and the simulator never imports it.
+This package only draws what the simulator or a run folder contains. It computes no physics, and
+the simulator never imports it.
 """

@@ -1,4 +1,4 @@
-"""Dashboards of a run of one data center, from the rows that it has in steps.parquet.
+"""Dashboards of a run of one data center, drawn from its rows of steps.parquet.
 
 Every function takes a pandas DataFrame with a column ``time`` and the columns of
 ``StepResult.per_dc()``, one row per step, and returns a matplotlib ``Figure``. Times are local
@@ -65,7 +65,7 @@ DAY_COLUMNS = (
     "tripped_racks",
     "grid_up",
 )
-"""Columns that ``day`` reads besides those of the panels over time."""
+"""Columns of steps.parquet that ``day`` reads in addition to ``PANEL_COLUMNS``."""
 
 CARPETS = (
     ("outdoor_c", 1.0, "outdoor (°C)", "inferno"),
@@ -75,14 +75,17 @@ CARPETS = (
     ("ci_g_per_kwh", 1.0, "carbon intensity (g CO₂e/kWh)", "cividis"),
     ("carbon_kg_per_h", 1.0, "emitted (kg CO₂e/h)", "cividis"),
 )
-"""Quantities that ``year`` shows by day and hour: column, factor, label, colour map."""
+"""Quantities that ``year`` shows as heat maps by day and hour: column, factor, label, colour map.
+
+Values of the column are multiplied by the factor to get the unit of the label.
+"""
 
 ENERGY_COLUMNS = ("it_kwh", "hvac_kwh", "carbon_g")
-"""Columns of which ``year`` shows sums by month or day."""
+"""Columns that ``year`` sums by month or day and shows as bars."""
 MAX_SCATTER_POINTS = 6_000
-"""Largest number of points of a scatter; of longer runs a random choice of steps is drawn."""
+"""Largest number of points in a scatter plot; longer runs show a random sample of their steps."""
 MAX_NAMED_BARS = 13
-"""Largest number of bars that are labelled."""
+"""Largest number of labelled bars; with more bars, only every second, third, ... has a label."""
 EVENT_SHADES = {
     "crac_down": (BLUE, "//"),
     "chiller_derate": (GREEN, "\\\\"),
@@ -93,21 +96,25 @@ EVENT_SHADES = {
     "rack_fan_failure": (GREY, ".."),
     "heat_wave": ("#B8A800", "--"),
 }
-"""Colour and hatching of events by kind; grid outages are shaded by the column ``grid_up``."""
+"""Colour and hatching of each kind of event.
+
+Grid outages have no entry, because the column ``grid_up`` of the steps already shows them.
+"""
 
 
 def day(
     steps: pd.DataFrame, date: str, title: str = "", events: Sequence[Mapping[str, Any]] = ()
 ) -> Figure:
-    """One day: temperatures, power by device, carbon, commands, queue and battery.
+    """Draw one day: temperatures, power by device, carbon, commands, task queue and battery.
 
-    Hours in which racks are throttled or tripped, the grid is down or an event lasts are shaded.
+    Times are shaded while racks are throttled or tripped, the grid is down or an event lasts.
 
     Args:
         steps: steps of the data center.
-        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
-        title: written above, such as the name of the data center.
-        events: those of the data center in metrics.json.
+        date: ``MM-DD`` for the first such day of the run, or ``YYYY-MM-DD`` with the year that
+            the column ``time`` has on that day.
+        title: text above the figure, such as the name of the data center.
+        events: events of the data center, as in metrics.json.
 
     Raises:
         SdcError: matplotlib or a column is missing, or the run does not have the day.
@@ -123,7 +130,8 @@ def day(
     draw_power(panels[1], shown)
     draw_carbon(panels[2], shown)
     _draw_commands(panels[3], shown)
-    # The day begins with the storage that the step before left.
+    # Queue and charge are values at the end of a step, so the curves begin at midnight with those
+    # of the previous day's last step.
     draw_storage(panels[4], steps.iloc[max(first - 1, 0) : after])
     format_day_axis(panels[-1], shown, over_a_year=is_over_a_year(steps))
     add_title(figure, short_name(title))
@@ -131,20 +139,20 @@ def day(
 
 
 def hottest_day(steps: pd.DataFrame) -> str:
-    """Day of the hottest inlet as ``day`` takes it, the first if several are equal."""
+    """Return the day with the hottest rack inlet of the run, YYYY-MM-DD; the earliest on a tie."""
     hottest = steps["time"].iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
     return str(hottest.strftime("%Y-%m-%d"))
 
 
 def year(steps: pd.DataFrame, title: str = "") -> Figure:
-    """A run of two days to years: maps of its values by day and hour, and monthly totals.
+    """Draw a run of two days or more: heat maps by day and hour, and monthly or daily totals.
 
     Args:
         steps: steps of the data center.
-        title: written above, such as the name of the data center.
+        title: text above the figure, such as the name of the data center.
 
     Raises:
-        SdcError: matplotlib or a column is missing, or the run has fewer than two days.
+        SdcError: matplotlib or a column is missing, or the run is shorter than two days.
     """
     figure = new_figure(14.0, 12.5)
     columns = {name for name, *_ in CARPETS} - {"carbon_kg_per_h"}
@@ -168,14 +176,14 @@ def year(steps: pd.DataFrame, title: str = "") -> Figure:
 
 
 def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
-    """Setpoint, relative HVAC power and hottest inlet of each step, by weather and load.
+    """Draw setpoint, relative HVAC power and hottest inlet against weather and load.
 
-    A point is a step at its outdoor temperature and IT power. Three panels colour it by the
-    setpoint, by the ratio of HVAC to IT power, and by the hottest inlet.
+    Each point is a step, at its outdoor temperature and IT power. The three panels colour the
+    points by the setpoint, by the ratio of HVAC to IT power, and by the hottest inlet.
 
     Args:
         steps: steps of the data center.
-        title: written above, such as the name of the data center.
+        title: text above the figure, such as the name of the data center.
 
     Raises:
         SdcError: matplotlib or a column is missing.
@@ -183,7 +191,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
     figure = new_figure(14.0, 4.8)
     check_steps(steps, ("time", "outdoor_c", "it_w", "hvac_w", "setpoint_c", "inlet_max_c"))
     shown = steps[(steps["it_w"] > 0).to_numpy()]
-    # In a fixed random order, so that no season hides another.
+    # Points are drawn in a fixed random order, so that no season covers the points of another.
     shown = shown.iloc[np.random.default_rng(0).permutation(len(shown))[:MAX_SCATTER_POINTS]]
     share = 100.0 * shown["hvac_w"] / shown["it_w"]
     for axes, values, label, cmap in zip(
@@ -211,13 +219,13 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
 
 
 def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
-    """Carbon intensity, battery power and charge over the hours of a day.
+    """Draw carbon intensity, battery power and battery charge by the hour of the day.
 
-    Lines are means over the days of the run, bands hold 80 % of them.
+    Lines are means over the days of the run; bands are from the 10th to the 90th percentile.
 
     Args:
         steps: steps of the data center.
-        title: written above, such as the name of the data center.
+        title: text above the figure, such as the name of the data center.
 
     Raises:
         SdcError: matplotlib or a column is missing.
@@ -238,7 +246,7 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
         panels[1].stairs(power, edges, fill=True, color=colour, label=label, alpha=0.85)
     panels[1].axhline(0.0, color="black", linewidth=0.8)
     panels[1].set_ylabel("battery, mean (kW)")
-    # At the ends of the steps, for which it stands.
+    # ``soc`` is the state of charge at the end of a step.
     _draw_daily_band(panels[2], 100.0 * steps["soc"], hours + step_h, GREEN)
     panels[2].set_ylabel("battery charge (%)")
     panels[2].set_ylim(0, 100)
@@ -252,17 +260,17 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
 
 
 def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
-    """Hours in which each rack had the hottest inlet of the hall, and its highest inlet.
+    """Draw how many hours each rack had the hottest inlet of the hall, and its peak inlet.
 
-    Racks that are equally hot, up to ``TIE_K``, all have the hottest inlet.
+    Racks within ``TIE_K`` of the hottest inlet all count as hottest.
 
     Args:
-        racks: racks of the data center, as ``read_racks`` returns them.
+        racks: one row per rack of the data center, as ``read_racks`` returns them.
         hall: the hall of the data center.
-        title: written above, such as the name of the data center.
+        title: text above the figure, such as the name of the data center.
 
     Raises:
-        SdcError: matplotlib or a column is missing, or there is not a row for each rack.
+        SdcError: matplotlib or a column is missing, or the number of rows is not that of racks.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -298,12 +306,12 @@ def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
 def _draw_day_temperatures(
     axes: Axes, steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Draw temperatures over a day, and shade what was out of order."""
+    """Draw the temperatures of a day in C, and shade the times of disturbances."""
     for name, colour, label, width in (
         ("outdoor_c", GREY, "outdoor", 1.4),
         ("wet_bulb_c", SKY, "wet bulb", 1.4),
         ("inlet_max_c", RED, "hottest inlet", 1.4),
-        # Mostly equal, so the wider line shows on both sides of the other.
+        # Supply air and setpoint are mostly equal, so the supply air gets a wider line behind.
         ("supply_c", "#80B8D8", "supply air", 4.0),
         ("setpoint_c", "black", "setpoint", 1.2),
     ):
@@ -324,7 +332,7 @@ def _draw_day_temperatures(
 def _disturbances(
     steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> list[tuple[npt.NDArray[np.bool_], str, str, str]]:
-    """Disturbances of the run: mask over the steps, colour, hatching and label of each."""
+    """Return mask over the steps, colour, hatching and label of each kind of disturbance."""
     shades = [
         ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
         ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),
@@ -343,7 +351,7 @@ def _disturbances(
 
 
 def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw the commands, as lines of different width because they are often equal."""
+    """Draw the three commands of a controller, in widths that show lines of equal values."""
     for name, colour, label, width in (
         ("load_command", PINK, "load (− defer, + drain)", 5.0),
         ("cooling_command", SKY, "setpoint (steps)", 2.8),
@@ -357,12 +365,14 @@ def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: str) -> None:
-    """Draw days to the right and hours of the day upwards; hours without a step stay white.
+    """Draw a heat map with one column per day and one row per time of day.
+
+    Times without a step stay white.
 
     Args:
-        axes: where to draw.
-        times: times of the steps.
-        values: a value per step.
+        axes: axes to draw in.
+        times: times at which the steps begin.
+        values: one value per step.
         label: label of the colour bar, with the unit.
         cmap: name of the colour map.
     """
@@ -395,10 +405,10 @@ def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: st
 
 
 def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
-    """Draw energy and carbon per month, or per day of runs up to two months.
+    """Draw energy and carbon per month, or per day if the run is shorter than 62 days.
 
     Args:
-        both: axes of energy and of carbon.
+        both: the two axes, for energy and for carbon.
         steps: steps of the data center.
     """
     import pandas as pd
@@ -432,19 +442,19 @@ def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
 
 
 def _hour_of_day(steps: pd.DataFrame) -> F64:
-    """Time of day at which each step begins, in h."""
+    """Return the time of day at which each step begins, in h, one value per step."""
     times = steps["time"].to_numpy()
     since = times - times.astype("datetime64[D]")
     return np.asarray(since / np.timedelta64(1, "h"), dtype=np.float64)
 
 
 def _draw_daily_band(axes: Axes, values: pd.Series, hours: F64, colour: str) -> None:
-    """Draw the mean over the days and the band of 80 % of them, by the hour of the day.
+    """Draw mean and 10th to 90th percentile over the days, by the hour of the day.
 
     Args:
-        axes: where to draw.
-        values: a value per step.
-        hours: hour of the day that each value stands for.
+        axes: axes to draw in.
+        values: one value per step.
+        hours: hour of the day at which each value is drawn, one per step.
         colour: colour of line and band.
     """
     groups = values.groupby(hours)

@@ -1,8 +1,8 @@
-"""Pictures of what drives data centers: workload, temperature and carbon intensity.
+"""Pictures of the input data of data centers: workload, temperature and carbon intensity.
 
-Sites are compared as in figures 10 to 16 of the SustainDC paper: over the run, over the day, and by
-how far the intensity of a grid varies within the day against its mean. These pictures take named
-pandas series of values by local standard time, such as a column of steps.parquet.
+The pictures follow figures 10 to 16 of the SustainDC paper. They compare sites over the run, over
+the mean day, and by the mean and the daily variation of carbon intensity. Inputs are named pandas
+series that are indexed by local standard time, such as a column of steps.parquet.
 """
 
 from __future__ import annotations
@@ -35,36 +35,36 @@ if TYPE_CHECKING:
     from pandas.api.typing import SeriesGroupBy
 
 DAILY_FROM_DAYS = 60
-"""Length from which series are shown by day or week, in days; shorter ones have every step."""
+"""Length from which ``comparison`` shows weekly means, in days; shorter series show every step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Quantity that a series holds."""
+    """Quantity of a series: how its values are scaled, labelled and coloured."""
 
     label: str
     """Label of the axis, with the unit."""
     colour: str
-    """Colour of a line that is alone in its axes."""
+    """Colour of the line in axes with a single line."""
     factor: float = 1.0
-    """Unit of the series over the unit of the label; values are multiplied by it."""
+    """Factor that converts values of the series to the unit of the label."""
 
 
 TEMPERATURE = Quantity("outdoor temperature (°C)", RED)
-"""Outdoor temperature, of series in C."""
+"""Outdoor temperature, for series in C."""
 CARBON = Quantity("carbon intensity (g CO₂e/kWh)", "black")
-"""Carbon intensity, of series in g CO2e/kWh."""
+"""Carbon intensity, for series in g CO2e/kWh."""
 WORKLOAD = Quantity("workload (% of capacity)", BLUE, 100.0)
-"""Work, of series in shares of the capacity."""
+"""Workload, for series in shares of the capacity (0..1)."""
 
 
 def comparison(series: Mapping[str, pd.Series], quantity: Quantity, title: str = "") -> Figure:
-    """Sites or traces in one picture: over the run, and over the hours of the mean day.
+    """Draw series of several sites in one picture: over the run, and over the mean day.
 
     Args:
-        series: name to values by time.
-        quantity: what they are.
-        title: written above, such as where the data come from.
+        series: values of each site or trace by time, keyed by its name.
+        quantity: the quantity of all series.
+        title: text above the figure, such as the source of the data.
 
     Raises:
         SdcError: matplotlib is missing, or a series has fewer than two values.
@@ -76,13 +76,13 @@ def comparison(series: Mapping[str, pd.Series], quantity: Quantity, title: str =
     for index, (name, values) in enumerate(series.items()):
         style = line_style(index)
         shown = quantity.factor * values
-        over, times = shown, _times(shown)
+        curve, times = shown, _times(shown)
         if by_week:
             weeks = shown.resample("7D")
-            over = weeks.mean()
-            # At its middle; the last one is not whole.
-            times = _times(over) + weeks.count().to_numpy() * (times[1] - times[0]) / 2
-        left.plot(times, over, label=literal_text(name), linewidth=1.3, **style)
+            curve = weeks.mean()
+            # A mean is drawn at the middle of its week; the last week may be shorter.
+            times = _times(curve) + weeks.count().to_numpy() * (times[1] - times[0]) / 2
+        left.plot(times, curve, label=literal_text(name), linewidth=1.3, **style)
         hourly = shown.groupby(_times(shown).hour).mean()
         right.plot(hourly.index + 0.5, hourly, linewidth=1.6, **style)
     for axes in (left, right):
@@ -100,17 +100,19 @@ def comparison(series: Mapping[str, pd.Series], quantity: Quantity, title: str =
 
 
 def carbon_variation(series: Mapping[str, pd.Series], title: str = "") -> Figure:
-    """Mean carbon intensity of each site against how far it varies within the day.
+    """Draw the mean carbon intensity of each site against its variation within the day.
 
-    The variation is the coefficient of variation of a day's values, standard deviation over mean,
-    averaged over the days. To the right, time of use matters more; above, every kWh does.
+    The variation is the coefficient of variation of one day's values (standard deviation divided
+    by mean), averaged over the days. Shifting work in time saves more at sites further to the
+    right; saving any kWh matters more at sites further up.
 
     Args:
-        series: name to carbon intensity by time, of a day or more.
-        title: written above, such as where the data come from.
+        series: carbon intensity of each site by time, one day or longer, keyed by the site's name.
+        title: text above the figure, such as the source of the data.
 
     Raises:
-        SdcError: matplotlib is missing, or a series has fewer than two values or a mean of zero.
+        SdcError: matplotlib is missing, a series has fewer than two values, or the mean of a day
+            is not positive.
     """
     check_series(series)
     figure = new_figure(7.6, 5.2)
@@ -131,14 +133,16 @@ def carbon_variation(series: Mapping[str, pd.Series], title: str = "") -> Figure
 
 
 def mean_and_variation(name: str, values: pd.Series) -> tuple[float, float]:
-    """Mean of a series, and standard deviation over mean within a day, averaged over the days.
+    """Return the mean of a series and its coefficient of variation within a day.
+
+    The coefficient of variation (standard deviation divided by mean) is averaged over the days.
 
     Args:
-        name: name of the series, for errors.
+        name: name of the series, for error messages.
         values: values by time.
 
     Raises:
-        SdcError: a day with a mean that is not positive.
+        SdcError: the mean of a day is not positive.
     """
     days = daily(values)
     mean, deviation = days.mean().to_numpy(), days.std(ddof=0).to_numpy()
@@ -148,15 +152,15 @@ def mean_and_variation(name: str, values: pd.Series) -> tuple[float, float]:
 
 
 def daily(values: pd.Series) -> SeriesGroupBy[Any, Any]:
-    """Values grouped by day."""
+    """Return the values of a series grouped by calendar day."""
     return values.groupby(_times(values).normalize())
 
 
 def check_series(series: Mapping[str, pd.Series]) -> None:
-    """Refuse no series, or one with fewer than two values.
+    """Check that there is at least one series, and that each has two values or more.
 
     Raises:
-        SdcError: there is no series, or one is too short.
+        SdcError: there is no series, or a series is too short.
     """
     if not series:
         raise SdcError("no series; valid is one or more")
@@ -166,22 +170,22 @@ def check_series(series: Mapping[str, pd.Series]) -> None:
 
 
 def _times(values: pd.Series) -> pd.DatetimeIndex:
-    """Times of a series."""
+    """Return the index of a series as pandas times."""
     import pandas as pd
 
     return pd.DatetimeIndex(values.index)
 
 
 def days_of(values: pd.Series) -> float:
-    """Time from the first to the last value of a series, in days."""
+    """Return the time from the first to the last value of a series, in days."""
     return float((values.index[-1] - values.index[0]).total_seconds() / 86400.0)
 
 
 def draw_year(series: tuple[Series, ...], title: str) -> Figure:
-    """Daily mean and range over the year, and the mean day of four months, for each series.
+    """Draw daily mean and range over a year, and the mean day of four months, of each series.
 
     Args:
-        series: whole years; the first year is drawn.
+        series: series of one or more whole years, of which the first year is drawn.
         title: title of the figure.
 
     Raises:

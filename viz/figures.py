@@ -1,6 +1,6 @@
 """Pictures of a hall in one step, of a run over time, and of one day under several controllers.
 
-Functions for users return a ``matplotlib.figure.Figure``; ``figure.savefig(path)`` writes it.
+Public functions return a ``matplotlib.figure.Figure``; ``figure.savefig(path)`` writes it.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ if TYPE_CHECKING:
 
 
 def hall_map(result: StepResult, fleet: Fleet, dc: int = 0) -> Figure:
-    """Inlet and outlet temperature of every rack of one hall, hottest racks outlined.
+    """Draw inlet and outlet temperature of every rack of one hall, hottest racks outlined.
 
     Args:
-        result: one step.
-        fleet: the fleet it belongs to.
+        result: result of one step of the fleet.
+        fleet: the fleet.
         dc: index of the data center.
 
     Raises:
-        SdcError: matplotlib is missing, or result, fleet and index do not fit together.
+        SdcError: matplotlib is missing, the result is of another fleet, or the index is invalid.
     """
     figure = new_figure(9.6, 4.2)
     check_result(result, fleet, dc)
@@ -73,16 +73,17 @@ def hall_map(result: StepResult, fleet: Fleet, dc: int = 0) -> Figure:
 
 
 def step_at(results: Iterable[StepResult], fleet: Fleet, when: str, dc: int = 0) -> StepResult:
-    """The first of some steps that covers a time of the data center's clock.
+    """Return the first step that covers a time of day on the clock of a data center.
 
     Args:
-        results: steps in order, such as a list or a generator; read up to the step in question.
-        fleet: the fleet they belong to.
+        results: results of steps in order, as a list or a generator. A generator is read up to
+            the step that covers the time.
+        fleet: the fleet of the results.
         when: ``MM-DD HH:MM``, local standard time.
         dc: index of the data center.
 
     Raises:
-        SdcError: the text is no such time, or no step covers it.
+        SdcError: the time has another format, or no step covers it.
     """
     if re.fullmatch(r"\d\d-\d\d \d\d:\d\d", when) is None:
         raise SdcError(f"time {when!r}: valid is MM-DD HH:MM, for example 07-01 15:00")
@@ -101,13 +102,13 @@ def step_at(results: Iterable[StepResult], fleet: Fleet, when: str, dc: int = 0)
 
 
 def overview(steps: pd.DataFrame) -> Figure:
-    """A run of one data center: weather, power by device, carbon, queue and battery.
+    """Draw a run of one data center: weather, power by device, carbon, task queue and battery.
 
     Args:
         steps: one row per step with ``time`` and the columns of ``StepResult.per_dc``.
 
     Raises:
-        SdcError: matplotlib is missing, a column is missing, fewer than two rows, or times that do
+        SdcError: matplotlib or a column is missing, there are fewer than two rows, or the times do
             not increase.
     """
     figure = new_figure(12.0, 9.0)
@@ -121,7 +122,10 @@ def overview(steps: pd.DataFrame) -> Figure:
 
 
 def step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
-    """Time at which a step begins on the clock of a data center, as in steps.parquet."""
+    """Return the time at which a step begins, on the clock of a data center.
+
+    The time is local standard time in a placeholder year, as in steps.parquet.
+    """
     day = day_of_year(fleet.configs[dc].site.start)
     start = np.array([day * 24 * fleet.steps_per_hour])
     times = step_times(start, np.array([result.step]), fleet.steps_per_hour)
@@ -129,7 +133,7 @@ def step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
 
 
 def check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
-    """Check that a result belongs to the fleet, and that the fleet has the index."""
+    """Check that a result has the racks of a fleet, and that ``dc`` is an index of the fleet."""
     if not 0 <= dc < fleet.size:
         raise SdcError(f"data center {dc}: valid is 0..{fleet.size - 1}")
     if len(result.rack_inlet_c) != fleet.racks:
@@ -139,13 +143,21 @@ def check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
 
 
 def clock_text(result: StepResult, fleet: Fleet, dc: int) -> str:
-    """Day and time of day at which a step begins."""
+    """Return day and time of day at which a step begins, such as ``1 July 15:00``."""
     when: datetime = step_time(result, fleet, dc).astype(datetime)
     return f"{when.day} {when:%B %H:%M}"
 
 
 def draw_hall(axes: Axes, quantity: str, result: StepResult, fleet: Fleet, dc: int) -> None:
-    """Draw inlet or outlet of the racks of a hall, with numbers in a small one."""
+    """Draw the inlet or outlet temperature of each rack of a hall, as numbers too in small halls.
+
+    Args:
+        axes: axes to draw in.
+        quantity: ``inlet`` or ``outlet``.
+        result: result of one step.
+        fleet: the fleet of the result.
+        dc: index of the data center.
+    """
     from matplotlib.ticker import MaxNLocator
 
     hall = fleet.configs[dc].hall
@@ -173,7 +185,7 @@ POWERS = {
     "condenser_pump_w": ("condenser pump", PINK),
     "crac_fan_w": ("CRAC fan", RED),
 }
-"""Powers that are stacked: from the column to its name and colour."""
+"""Powers of devices that ``draw_power`` stacks: name and colour, keyed by column."""
 
 PANEL_COLUMNS = (
     "time",
@@ -187,11 +199,11 @@ PANEL_COLUMNS = (
     "queue_tasks",
     "soc",
 )
-"""Columns of steps.parquet that the panels read."""
+"""Columns of steps.parquet that the panels of ``overview`` and of a day read."""
 
 
 def draw_temperatures(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw outdoor temperature, wet bulb and setpoint."""
+    """Draw outdoor temperature, wet-bulb temperature and supply setpoint, in C."""
     for name, colour, label in (
         ("outdoor_c", RED, "outdoor"),
         ("wet_bulb_c", SKY, "wet bulb"),
@@ -203,7 +215,7 @@ def draw_temperatures(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw power by device, stacked."""
+    """Draw the power of each device, stacked, in kW."""
     powers = [steps[column] / 1e3 for column in POWERS]
     axes.stackplot(
         step_edges(steps),
@@ -214,7 +226,7 @@ def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
         step="post",
     )
     counted = (steps["it_w"] + steps["overhead_w"]) / 1e3
-    # Presets may leave devices out of the HVAC total.
+    # A preset may exclude devices from the HVAC total; then the total is not the sum of devices.
     if not np.allclose(counted, sum(powers), rtol=1e-6):
         draw_steps(axes, steps, counted, color="black", linewidth=1.2, label="counted in total")
     axes.set_ylabel("power (kW)")
@@ -223,7 +235,7 @@ def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def draw_carbon(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw carbon intensity, and emissions behind it."""
+    """Draw carbon intensity as a line, and emissions as an area behind the line."""
     emitted = axes.twinx()
     kg_per_h = steps["carbon_g"] / 1e3 / step_hours(steps)
     emitted.fill_between(step_edges(steps), repeat_last(kg_per_h), color=GREY, alpha=0.35,
@@ -236,7 +248,7 @@ def draw_carbon(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def draw_storage(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw queue and battery charge at the ends of the steps, for which they stand."""
+    """Draw task queue and battery charge, which are values at the end of each step."""
     ends = step_edges(steps)[1:]
     charge = axes.twinx()
     charge.fill_between(ends, 100 * steps["soc"], color=GREEN, alpha=0.3, linewidth=0)
@@ -249,7 +261,7 @@ def draw_storage(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def _put_in_front(axes: Axes, behind: Axes) -> None:
-    """Draw axes in front of their twin."""
+    """Draw axes in front of the twin axes ``behind``."""
     axes.set_zorder(behind.get_zorder() + 1)
     axes.patch.set_visible(False)
     behind.spines[:].set_visible(False)
@@ -257,24 +269,26 @@ def _put_in_front(axes: Axes, behind: Axes) -> None:
 
 
 OPTIMUM_COLUMNS = ("time", "ci_g_per_kwh", "price_per_kwh", "utilisation", "setpoint_c", "soc")
-"""Columns of steps.parquet that the picture reads."""
+"""Columns of steps.parquet that ``optimum_day`` reads."""
 IDLE = "idle"
-"""Label that is drawn in grey."""
+"""Label of the idle controller, whose lines are grey."""
 
 
 def optimum_day(
     steps_of: Mapping[str, pd.DataFrame], date: str, title: str = "", *, by_price: bool = False
 ) -> Figure:
-    """Grid, load, setpoint and battery over one day, under each of several controllers.
+    """Draw grid, load, setpoint and battery over one day, under each of several controllers.
 
     Args:
-        steps_of: steps of one data center under each controller, by label.
-        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
-        title: written above, such as the name of the data center.
-        by_price: whether to draw the price of a kWh in place of its carbon intensity.
+        steps_of: steps of one data center under each controller, keyed by label.
+        date: ``MM-DD`` for the first such day of the run, or ``YYYY-MM-DD`` with the year that
+            the column ``time`` has on that day.
+        title: text above the figure, such as the name of the data center.
+        by_price: True to draw the price of a kWh instead of its carbon intensity.
 
     Raises:
-        SdcError: matplotlib or a column is missing, runs of other times, or without the day.
+        SdcError: matplotlib or a column is missing, the runs have different times, or the run
+            does not contain the day.
     """
     figure = new_figure(11.0, 9.0)
     first = next(iter(steps_of.values()))
@@ -308,18 +322,18 @@ def optimum_day(
 
 
 def day_of_most_saved(saved: F64, times: pd.Series) -> str:
-    """Day on which most is saved, YYYY-MM-DD, the first if several are equal.
+    """Return the day with the largest saving, YYYY-MM-DD; the earliest on a tie.
 
     Args:
-        saved: what is saved in each step.
+        saved: saving in each step, in any unit.
         times: times at which the steps begin.
     """
     days = times.dt.strftime("%Y-%m-%d").to_numpy()
     names, of_step = np.unique(days, return_inverse=True)
-    # Rounded, because sums of equal days may differ in their last digits.
+    # Sums are compared after rounding, because equal days may differ by rounding errors.
     sums = np.bincount(of_step, weights=saved)
     steps = np.bincount(of_step)
-    # Days that the run has in part are shown only where there are no others.
+    # Days that the run covers only in part are excluded unless there are no complete days.
     whole = np.where(steps == steps.max(), sums, -np.inf)
     return str(names[int(np.argmax(np.round(whole, 6)))])
 
@@ -327,7 +341,13 @@ def day_of_most_saved(saved: F64, times: pd.Series) -> str:
 def _draw_controllers(
     panels: list[Axes], steps_of: Mapping[str, pd.DataFrame], rows: tuple[int, int]
 ) -> None:
-    """Draw utilisation, setpoint and battery charge under each controller."""
+    """Draw utilisation, setpoint and battery charge under each controller.
+
+    Args:
+        panels: axes of the three quantities.
+        steps_of: steps of one data center under each controller, keyed by label.
+        rows: first row of the day, and first row after the day.
+    """
     colours = iter(LINE_COLOURS * len(steps_of))
     first, after = rows
     for index, (label, steps) in enumerate(steps_of.items()):
@@ -337,6 +357,7 @@ def _draw_controllers(
         shown = steps.iloc[first:after]
         draw_steps(panels[0], shown, 100.0 * shown["utilisation"], **style)
         draw_steps(panels[1], shown, shown["setpoint_c"], **style)
-        # The day begins with what the step before left.
+        # The charge is a value at the end of a step, so the curve begins at midnight with that of
+        # the previous day's last step.
         before = steps.iloc[max(first - 1, 0) : after]
         panels[2].plot(step_edges(before)[1:], 100.0 * before["soc"], **style)

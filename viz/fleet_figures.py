@@ -1,4 +1,4 @@
-"""Pictures of many data centers, and of runs side by side: radar, best values, benchmarks."""
+"""Pictures of fleets of data centers, comparisons of runs, sweeps and benchmarks."""
 
 from __future__ import annotations
 
@@ -47,24 +47,27 @@ RADAR_METRICS = (
     ("water_l", "water", "L"),
     ("queue_mean_tasks", "task queue, mean", "tasks"),
 )
-"""The five metrics by which the SustainDC paper compares controllers (section 5, figure 4): name in
-metrics.json, label, unit."""
+"""Five metrics by which the SustainDC paper compares controllers (section 5, figure 4).
+
+Each has its name in metrics.json, label and unit.
+"""
 MAX_RUNS = 12
-"""Largest number of runs in one radar."""
+"""Largest number of runs in one radar chart."""
 CENTRES_PCT = (99.0, 98.0, 95.0, 90.0, 80.0, 50.0, 0.0)
-"""Values that the middle of a radar's axis may stand for, in % of the worst run."""
+"""Values at which the axis of a radar chart may begin in the centre, in % of the worst run."""
 MAX_MAP_ROWS = 40
 """Largest number of data centers in ``fleet_map``."""
 
 
 def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
-    """Five metrics of several runs; less is better, so the smallest polygon is the best.
+    """Draw five metrics of several runs as a radar chart.
 
-    Each axis ends at the worst of the runs, which is printed with its value. Its middle stands for
-    0 or a share of the worst, printed too, such that small differences can be seen.
+    Less is better in every metric, so the smallest polygon is the best. Each axis runs from a
+    printed value at the centre to the worst run's value at the rim. The value at the centre is 0
+    or close enough below the best run to make small differences visible.
 
     Args:
-        runs: name to the metrics of a run, as ``total`` or ``metrics`` in metrics.json.
+        runs: metrics of each run, as ``total`` or ``metrics`` in metrics.json, keyed by name.
 
     Raises:
         SdcError: matplotlib or a metric is missing, or there are fewer than two or more than
@@ -73,7 +76,7 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
     figure = new_figure(11.0, 6.4)
     values = _radar_values(runs)
     worst = values.max(axis=0)
-    # Where all are zero, all are as good as can be.
+    # A metric that is zero in all runs has the best possible share, 0 %, in each of them.
     share = 100.0 * values / np.where(worst > 0.0, worst, 1.0)
     centre = np.array([_centre_pct(column) for column in share.T])
     radius = (share - centre) / (100.0 - centre)
@@ -91,8 +94,8 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
     axes.set_ylim(0.0, 1.0)
     axes.set_yticks([0.25, 0.5, 0.75, 1.0], [])
     labels = [
-        _radar_label(label, unit, most, most * low / 100)
-        for (_, label, unit), most, low in zip(RADAR_METRICS, worst, centre, strict=True)
+        _radar_label(label, unit, rim, rim * centre_pct / 100)
+        for (_, label, unit), rim, centre_pct in zip(RADAR_METRICS, worst, centre, strict=True)
     ]
     axes.set_xticks(angle, labels, fontsize=9)
     axes.tick_params(axis="x", pad=6)
@@ -105,13 +108,14 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
 
 
 def fleet_overview(steps: pd.DataFrame) -> Figure:
-    """A run of a fleet: power, carbon, PUE and the hottest inlets of all data centers together.
+    """Draw power, PUE, carbon and hottest inlets of a whole fleet over a run.
 
     Args:
-        steps: two rows or more: ``time`` on the clock of the first data center; ``it_w``,
-            ``overhead_w`` and ``carbon_g``, sums over the data centers; ``inlet_low_c``,
-            ``inlet_mid_c``, ``inlet_high_c`` and ``inlet_max_c``, 10 %, median, 90 % and the
-            highest of their hottest inlets.
+        steps: one row per step, two or more. Its columns are ``time`` on the clock of the first
+            data center; ``it_w``, ``overhead_w`` and ``carbon_g``, each the sum over all data
+            centers; and ``inlet_low_c``, ``inlet_mid_c``, ``inlet_high_c`` and ``inlet_max_c``,
+            which are 10th percentile, median, 90th percentile and maximum over the data centers
+            of the hottest inlet of each.
 
     Raises:
         SdcError: matplotlib is missing.
@@ -157,17 +161,17 @@ def fleet_overview(steps: pd.DataFrame) -> Figure:
 
 
 def fleet_map(edges: npt.NDArray[np.datetime64], inlet_max_c: F64, names: Sequence[str]) -> Figure:
-    """Map of the hottest inlet of each data center over time.
+    """Draw the hottest inlet of each of B data centers over time, as a heat map.
 
-    The hottest data centers stand above, ``MAX_MAP_ROWS`` at most.
+    Data centers are sorted from the hottest down; at most ``MAX_MAP_ROWS`` are shown.
 
     Args:
-        edges: beginnings of the intervals shown and the end of the last, (n + 1,).
-        inlet_max_c: hottest inlet of each interval and data center, (n, B).
-        names: of the data centers, (B,).
+        edges: begin of each of n intervals and the end of the last one, (n + 1,).
+        inlet_max_c: hottest inlet in each interval and data center, in C, (n, B).
+        names: names of the data centers, (B,).
 
     Raises:
-        SdcError: matplotlib is missing, or the shapes do not fit.
+        SdcError: matplotlib is missing, or the shapes of the arguments are inconsistent.
     """
     from matplotlib.dates import date2num
 
@@ -197,10 +201,10 @@ def fleet_map(edges: npt.NDArray[np.datetime64], inlet_max_c: F64, names: Sequen
 
 
 def _radar_values(runs: Mapping[str, Mapping[str, Metric]]) -> F64:
-    """Values of the radar's metrics, (runs, metrics).
+    """Return the values of ``RADAR_METRICS`` of each run, (runs, metrics).
 
     Raises:
-        SdcError: fewer than two or too many runs, or a metric that is missing or negative.
+        SdcError: there are fewer than two or too many runs, or a metric is missing or negative.
     """
     if not 2 <= len(runs) <= MAX_RUNS:
         raise SdcError(f"{len(runs)} runs to compare; valid are 2 to {MAX_RUNS}")
@@ -215,7 +219,7 @@ def _radar_values(runs: Mapping[str, Mapping[str, Metric]]) -> F64:
 
 
 def _radar_label(label: str, unit: str, rim: float, middle: float) -> str:
-    """Label of an axis with the values at the rim and in the middle."""
+    """Return the label of an axis of a radar chart, with its values at the rim and the centre."""
     if rim == 0.0:
         return f"{label}\n0 {unit} for all"
     ends = f"{format_number(rim)} {unit} at the rim\n{format_number(middle)} in the middle"
@@ -223,45 +227,51 @@ def _radar_label(label: str, unit: str, rim: float, middle: float) -> str:
 
 
 def _centre_pct(share_pct: F64) -> float:
-    """The highest of ``CENTRES_PCT`` that leaves a quarter of the axis below the best value."""
+    """Return the largest of ``CENTRES_PCT`` that puts the best run a quarter of the axis outwards.
+
+    Args:
+        share_pct: values of one metric in all runs, in % of the worst run.
+    """
     best = float(share_pct.min())
     return next(c for c in CENTRES_PCT if best >= c + 0.25 * (100.0 - c) or c == 0.0)
 
 
 MOST_PANELS = 12
-"""Largest number of panels of a picture."""
+"""Largest number of panels of ``plot_best_values``."""
 _COLUMNS = 4
-"""Largest number of panels beside each other."""
-_LEAST_PCT, _MOST_PCT = 0.1, 20.0
-"""Least and largest value at the end of the colour bar, in %."""
+"""Largest number of panels in a row of ``plot_best_values``."""
+_MIN_LIMIT_PCT, _MAX_LIMIT_PCT = 0.1, 20.0
+"""Smallest and largest permitted upper end of the colour bar, in %."""
 
 
 class MonthlyFigures(NamedTuple):
-    """A metric of one data center in M months at V values of a field."""
+    """A metric of one data center in M months, at each of V values of a config field."""
 
     name: str
     """Name of the data center, such as its site."""
     months: Sequence[int]
-    """Months, 1..12, M of them."""
+    """Numbers of the M months, 1..12."""
     values: F64
-    """Values of the field, in ascending order, (V,)."""
+    """Values of the config field, in ascending order, (V,)."""
     figures: F64
-    """The metric, of which less is better, (M, V)."""
+    """Value of the metric in each month at each value of the field, (M, V); less is better."""
 
 
 def plot_best_values(
     panels: Sequence[MonthlyFigures], field: str, metric: str, default: float | None
 ) -> Figure:
-    """Draw how far the metric is above its least in each month, a panel for each data center.
+    """Draw which value of a config field minimises a metric in each month, per data center.
 
-    A dot is the best value of a month, the full line the best fixed value of all months, the dashed
-    one the value of the config. Of more than ``MOST_PANELS`` data centers the first are drawn.
+    Each data center has a panel, in which colours show by how many percent the metric exceeds its
+    minimum of the month. Dots mark the best value of each month, the solid line marks the best
+    constant value for all months, and the dashed line marks the configured value. At most
+    ``MOST_PANELS`` data centers are drawn, in the order of ``panels``.
 
     Args:
-        panels: the figures of each data center.
-        field: name of the field.
+        panels: the metric of each data center.
+        field: name of the config field.
         metric: name of the metric.
-        default: value of the config; None if it has no such number.
+        default: configured value of the field; None if it is not a number.
 
     Raises:
         SdcError: matplotlib is missing.
@@ -275,7 +285,7 @@ def plot_best_values(
         axis.set_visible(False)
     above_pct = [_above_least_pct(panel.figures) for panel in shown]
     top_pct = max(float(np.nanmax(above, initial=0.0)) for above in above_pct)
-    limit_pct = min(max(top_pct, _LEAST_PCT), _MOST_PCT)
+    limit_pct = min(max(top_pct, _MIN_LIMIT_PCT), _MAX_LIMIT_PCT)
     for axis, panel, above in zip(axes.flat, shown, above_pct, strict=False):
         image = _draw_panel(axis, panel, above, limit_pct, default)
     for axis in axes[:, 0]:
@@ -290,7 +300,11 @@ def plot_best_values(
 
 
 def _above_least_pct(figures: F64) -> F64:
-    """By how much figures, (M, V), are above the least of their month, in %."""
+    """Return the excess of a metric over its minimum of the month, in %, (M, V).
+
+    Args:
+        figures: metric in each month at each value of the field, (M, V).
+    """
     least = figures.min(axis=1, keepdims=True)
     return np.asarray(100.0 * (figures / np.where(least == 0.0, np.nan, least) - 1.0))
 
@@ -298,7 +312,18 @@ def _above_least_pct(figures: F64) -> F64:
 def _draw_panel(
     axes: Axes, panel: MonthlyFigures, above_pct: F64, limit_pct: float, default: float | None
 ) -> QuadMesh:
-    """Draw one data center."""
+    """Draw the panel of one data center in ``plot_best_values``.
+
+    Args:
+        axes: axes to draw in.
+        panel: the metric of the data center.
+        above_pct: excess of the metric over its minimum of the month, in %, (M, V).
+        limit_pct: upper end of the colour bar, in %.
+        default: configured value of the field; None if it is not a number.
+
+    Returns:
+        The coloured mesh, for the colour bar.
+    """
     figures, places = panel.figures, np.arange(len(panel.months))
     image = axes.pcolormesh(
         places,
@@ -325,12 +350,12 @@ def interval_plot(
     *,
     marks: Sequence[float] = (),
 ) -> Figure:
-    """Values with their intervals, one below the other.
+    """Draw named values with their confidence intervals, one below the other.
 
     Args:
-        intervals: name to a value and the ends of its interval, from the top to the bottom.
-        label: what the values are, with their unit.
-        marks: values at which vertical lines stand.
+        intervals: value, lower end and upper end of each interval, keyed by name, top row first.
+        label: label of the axis of values, with the unit.
+        marks: values at which vertical lines are drawn.
 
     Raises:
         SdcError: matplotlib is missing, or there are no intervals.
@@ -355,12 +380,15 @@ def interval_plot(
 
 
 def profile_plot(thresholds: F64, profiles: Mapping[str, F64], label: str) -> Figure:
-    """Share of runs above each of several thresholds, after Dolan and Moré (2002).
+    """Draw performance profiles after Dolan and Moré (2002).
+
+    A profile is the share of a method's weeks with a score above a threshold, as a function of
+    that threshold.
 
     Args:
-        thresholds: of the score, (T,).
-        profiles: name to the share of runs whose score is above each threshold, 0..1, (T,).
-        label: what the score is, with its unit.
+        thresholds: thresholds of the score, (T,).
+        profiles: share of weeks whose score exceeds each threshold, 0..1, (T,), keyed by method.
+        label: name of the score, with its unit.
 
     Raises:
         SdcError: matplotlib is missing.
