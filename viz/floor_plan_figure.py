@@ -1,4 +1,4 @@
-"""Floor plans of a hall to scale: at its design point, and after the worst loss of cooling."""
+"""Floor plans of a hall, to scale: at its design point, and after the worst cooling failure."""
 
 from __future__ import annotations
 
@@ -36,52 +36,55 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LONG_SIDE_IN = 11.0
-"""Largest width of the plan, in inches."""
+"""Largest width of a floor plan, in inches."""
 FAILOVER_SIDE_IN = 6.0
-"""Largest width of the plan beside the curves of a failover study, in inches."""
+"""Largest width of the floor plan in the figure of a failover study, in inches."""
 SHORT_SIDE_IN = (2.2, 8.0)
-"""Smallest and largest height of the plan, in inches; other halls are drawn stretched."""
+"""Smallest and largest height of a floor plan, in inches.
+
+Halls of more extreme proportions are stretched to this range.
+"""
 MAX_UNTOLD_STRETCH = 1.02
-"""Stretch up to which the label of the axis does not mention it."""
+"""Largest ratio of vertical to horizontal scale that the axis label does not mention."""
 RACK_LABEL_PX = (34.0, 15.0)
-"""Width and height of the number in a rack, in pixels."""
+"""Width and height that the number in a rack needs, in pixels."""
 MIN_ROW_PITCH_PX = 6.0
-"""Distance of rows below which aisles and fronts are left out, in pixels; they would blur."""
+"""Smallest distance of rows at which aisles and rack fronts are drawn, in pixels."""
 UNIT_SIZE_M = (0.9, 2.0)
-"""Smallest size of the symbol of a CRAC unit, off the wall and along it, in m."""
+"""Smallest depth (away from the wall) and width of the symbol of a CRAC unit, in m."""
 CURVES = 6
-"""Losses whose hottest inlet is drawn over time, the worst ones, beside that without a loss."""
+"""Number of worst losses whose hottest inlet is drawn over time, besides the case without loss."""
 
 
 @dataclass(frozen=True, slots=True)
 class RackValues:
-    """Values of the R racks of a floor plan, shown by colours."""
+    """Values of the R racks of a floor plan, which the colours of the racks show."""
 
     values: F64
     """Value of each rack, (R,)."""
     label: str
     """Name of the values with their unit, for the colour bar."""
     marked: int
-    """The rack that is outlined."""
+    """Index of the rack that is outlined."""
     mark_label: str
     """Description of the outlined rack, for the legend."""
     digits: int = 1
-    """Decimals of the numbers in the racks."""
+    """Number of decimals of the numbers in the racks."""
 
 
 def floor_plan_figure(
     hall: DataCenterConfig | DesignHall, shown: RackValues | None = None
 ) -> Figure:
-    """Walls, rows, aisles, floor tiles, returns and CRAC units, to scale.
+    """Draw walls, rows, aisles, floor tiles, air returns and CRAC units of a hall, to scale.
 
-    The longer side of the room runs to the right. Labels that would not fit are left out.
+    The longer side of the room is horizontal. Labels that do not fit are omitted.
 
     Args:
-        hall: a data center, or the result of ``solve_design_hall`` for it.
-        shown: values that colour the racks; None shows their inlets at the design point.
+        hall: config of a data center, or the result of ``solve_design_hall`` for it.
+        shown: values that colour the racks; None shows the rack inlets at the design point.
 
     Raises:
-        SdcError: matplotlib is missing, or the hall cannot be solved.
+        SdcError: matplotlib is missing, or the hall has no solution at its design point.
     """
     figure = new_figure(1.0, 1.0)
     solved = solve_design_hall(hall) if isinstance(hall, DataCenterConfig) else hall
@@ -113,9 +116,11 @@ def floor_plan_figure(
 
 
 def failover_figure(study: Failover) -> Figure:
-    """Floor plan with the inlets of the worst loss, and the hottest inlet of the worst over time.
+    """Draw a failover study: rack inlets after the worst loss, and hottest inlets over time.
 
-    CRAC units are coloured by the effect of their own loss: racks trip, throttle, or neither.
+    The floor plan shows the inlets after the worst loss of cooling, and colours each CRAC unit by
+    the effect of losing that unit alone: racks trip, racks throttle, or neither. The curves show
+    the hottest inlet of the hall after each of the worst losses.
 
     Args:
         study: result of ``study_failover``.
@@ -146,78 +151,84 @@ def failover_figure(study: Failover) -> Figure:
 
 @dataclass(frozen=True, slots=True)
 class _Page:
-    """Placement of a room on a page, where the longer side of the room runs to the right."""
+    """Placement of a room on a page, with the longer side of the room horizontal."""
 
     hall: HallConfig
-    """The hall."""
+    """Config of the hall."""
     plan: FloorPlan
-    """Places of its racks and walls."""
+    """Positions of the racks and walls of the hall."""
     is_turned: bool
-    """Whether y runs to the right, because that is the longer side of the room."""
+    """True if y is the longer side of the room, so that y is horizontal on the page."""
     unit_places_m: F64
-    """Places of the CRAC units on the walls, (U, 2)."""
+    """Positions of the U CRAC units on the end walls, in m, (U, 2)."""
     unit_m: tuple[float, float]
-    """Size of the symbol of a CRAC unit, off the wall and along it, in m."""
+    """Depth (away from the wall) and width of the symbol of a CRAC unit, in m."""
     limits_m: tuple[tuple[float, float], tuple[float, float]]
-    """Ends of the picture along x and y, in m."""
+    """Lower and upper end of the picture along x, and along y, in m."""
     size_in: tuple[float, float]
     """Width and height of the picture, in inches."""
     px_per_m: tuple[float, float]
     """Scale of the picture along x and y, in pixels per m."""
 
     def place(self, xy: npt.ArrayLike) -> npt.NDArray[Any]:
-        """Points of the room, (..., 2) in m, as coordinates on the page."""
+        """Convert points (x, y) of the room to page coordinates, in m, shape (..., 2)."""
         points = np.asarray(xy)
         return points[..., ::-1] if self.is_turned else points
 
     def point(self, x: float, y: float) -> tuple[float, float]:
-        """A point of the room, in m, as coordinates on the page."""
+        """Convert a point of the room to page coordinates, in m."""
         return (y, x) if self.is_turned else (x, y)
 
     def box(self, x0: float, x1: float, y0: float, y1: float) -> npt.NDArray[Any]:
-        """Corners of a rectangle of the room as coordinates on the page, (4, 2)."""
+        """Return the corners of a rectangle of the room in page coordinates, in m, (4, 2)."""
         return self.place([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
     def fits(self, x_m: float, y_m: float, px: tuple[float, float]) -> bool:
-        """Whether a rectangle of the room has room for a text of this width and height, in px."""
+        """Return True if a text fits into a rectangle of the room.
+
+        Args:
+            x_m: size of the rectangle along x, in m.
+            y_m: size of the rectangle along y, in m.
+            px: width and height of the text, in pixels.
+        """
         size = (x_m * self.px_per_m[0], y_m * self.px_per_m[1])
         width, height = size[::-1] if self.is_turned else size
         return width >= px[0] and height >= px[1]
 
     @property
     def row_y_m(self) -> F64:
-        """Middle of each row across the room, in m, (rows,)."""
+        """Coordinate y of the middle of each row, in m, (rows,)."""
         return self.plan.centre_m[:: self.hall.racks_per_row, 1]
 
     @property
     def row_gap_m(self) -> float:
-        """Distance of the rows, in m; the width of the room for one row."""
+        """Mean distance between the middles of adjacent rows, in m; of one row the room's width."""
         y = self.row_y_m
         return float(np.ptp(y)) / (len(y) - 1) if len(y) > 1 else self.plan.width_m
 
     @property
     def is_coarse(self) -> bool:
-        """Whether the rows are too close to draw their aisles."""
+        """True if the rows are too close on the page to draw their aisles."""
         return self.row_gap_m * self.px_per_m[1] < MIN_ROW_PITCH_PX
 
     @property
     def stretch(self) -> float:
-        """Scale upwards divided by the scale to the right."""
+        """Ratio of vertical to horizontal scale on the page."""
         x, y = self.px_per_m
         return x / y if self.is_turned else y / x
 
 
 def _page(hall: HallConfig, units: int, long_side_in: float) -> _Page:
-    """Choose the placement of a room on a page.
+    """Return the placement of a room on a page.
 
     Args:
-        hall: the hall.
-        units: number of CRAC units, which stand outside the end walls so that the room stays clear.
+        hall: config of the hall.
+        units: number of CRAC units; their symbols are outside the end walls, clear of the racks.
         long_side_in: largest width of the picture, in inches.
     """
     plan = floor_plan(hall)
     is_turned = plan.width_m > plan.length_m
-    # Symbols of large halls are larger, so that they can be seen.
+    # In large halls symbols are drawn larger than the units are, so that they remain visible.
     deep_m = max(UNIT_SIZE_M[0], (0.15 if is_turned else 0.03) * plan.length_m)
     wide_m = max(UNIT_SIZE_M[1], 0.05 * plan.width_m)
     near_m = 1.3 * deep_m
@@ -241,13 +252,13 @@ def _page(hall: HallConfig, units: int, long_side_in: float) -> _Page:
 
 
 def _draw_room(axes: Axes, page: _Page) -> None:
-    """Draw axes in m, aisles, fronts of the rows, walls, and return grilles in them."""
+    """Draw axes in m, aisles, fronts of the rows, walls, and return grilles in the end walls."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.ticker import MaxNLocator
 
     plan = page.plan
     axes.set_aspect(page.stretch)
-    words = ["x, along the rows (m)", "y, across the rows (m)"]
+    names = ["x, along the rows (m)", "y, across the rows (m)"]
     right, up = (1, 0) if page.is_turned else (0, 1)
     lengths_m = plan.length_m, plan.width_m
     axes.set_xlim(page.limits_m[right])
@@ -257,8 +268,8 @@ def _draw_room(axes: Axes, page: _Page) -> None:
         axis.set_ticks([t for t in ticks if 0.0 <= t <= lengths_m[side]])
     stretched = not 1 / MAX_UNTOLD_STRETCH < page.stretch < MAX_UNTOLD_STRETCH
     close = "; rows too close to draw their aisles" if page.is_coarse else ""
-    axes.set_xlabel(words[right] + close)
-    axes.set_ylabel(words[up] + (f"\nstretched {page.stretch:.1f} times" if stretched else ""))
+    axes.set_xlabel(names[right] + close)
+    axes.set_ylabel(names[up] + (f"\nstretched {page.stretch:.1f} times" if stretched else ""))
     axes.spines[:].set_visible(False)
     if not page.is_coarse:
         _draw_aisles(axes, page)
@@ -276,7 +287,7 @@ def _draw_room(axes: Axes, page: _Page) -> None:
 
 
 def _draw_aisles(axes: Axes, page: _Page) -> None:
-    """Tint the aisles; draw tiles in the cold ones and ceiling grilles above the hot ones."""
+    """Draw tinted aisles, with tiles in cold aisles and ceiling grilles above hot aisles."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     plan, layout = page.plan, page.hall.layout
@@ -309,7 +320,7 @@ def _draw_aisles(axes: Axes, page: _Page) -> None:
 
 
 def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
-    """Draw racks in the colours of their values, with numbers where they fit."""
+    """Draw racks in the colours of their values, with the values as numbers if they fit."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Polygon
     from matplotlib.ticker import MaxNLocator
@@ -347,13 +358,13 @@ def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
 
 
 def _draw_units(axes: Axes, page: _Page, texts: Sequence[str], **style: Any) -> None:
-    """Draw CRAC units outside of the end walls.
+    """Draw CRAC units outside the end walls.
 
     Args:
-        axes: where to draw.
+        axes: axes to draw in.
         page: placement of the room.
-        texts: text on each unit.
-        style: properties of the symbols.
+        texts: text on the symbol of each unit.
+        style: matplotlib properties of the symbols.
     """
     from matplotlib.collections import PolyCollection
 
@@ -368,7 +379,7 @@ def _draw_units(axes: Axes, page: _Page, texts: Sequence[str], **style: Any) -> 
 
 
 def _draw_design_units(axes: Axes, page: _Page, unit_m3s: F64) -> None:
-    """Draw CRAC units with their number and airflow where these fit."""
+    """Draw CRAC units, labelled with index and airflow in m³/s if the label fits."""
     texts = [""] * len(unit_m3s)
     if page.fits(*page.unit_m, (72.0, 28.0) if page.is_turned else (28.0, 72.0)):
         texts = [f"CRAC {unit}\n{_airflow_text(m3s)} m³/s" for unit, m3s in enumerate(unit_m3s)]
@@ -378,9 +389,10 @@ def _draw_design_units(axes: Axes, page: _Page, unit_m3s: F64) -> None:
 
 
 def _draw_failed_units(axes: Axes, page: _Page, study: Failover) -> None:
-    """Draw CRAC units in the colour of the effect of their loss, the lost ones with a thick edge.
+    """Draw CRAC units, each in a colour for the effect of losing that unit alone.
 
-    A unit that was not lost alone is grey.
+    A thick edge marks the units that fail in the worst loss. A unit is grey if the study did not
+    include the loss of that unit alone.
     """
     from matplotlib.patches import Patch
 
@@ -408,7 +420,7 @@ def _draw_failed_units(axes: Axes, page: _Page, study: Failover) -> None:
 
 
 def _label_rows(axes: Axes, page: _Page) -> None:
-    """Number the rows beside their ends, as many as fit."""
+    """Draw row numbers beside the ends of the rows, leaving out rows if space is short."""
     margin_m, gap_px = page.hall.layout.end_margin_m, page.row_gap_m * page.px_per_m[1]
     if margin_m * page.px_per_m[0] < 16.0:
         return
@@ -422,14 +434,14 @@ def _label_rows(axes: Axes, page: _Page) -> None:
 
 
 def _airflow_text(value: float) -> str:
-    """An airflow with three digits, or all those before the point."""
+    """Return an airflow as text, with three significant digits, or as an integer from 100 on."""
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
 def _draw_curves(axes: Axes, study: Failover) -> None:
-    """Hottest inlet over time after the worst losses, with the limits of the class."""
+    """Draw the hottest inlet over time after the worst losses, and the protection's limits."""
     minutes = np.arange(MINUTES + 1)
-    # All begin in the steady state of a hall in order.
+    # At minute 0 all curves have the steady-state inlet of the hall without a loss.
     inlet_c = study.inlet_max_c[[0, *range(MINUTES)]]
     inlet_c[0] = inlet_c[0, 0]
     drawn = [i for i in study.worst if i != 0][:CURVES]

@@ -1,4 +1,4 @@
-"""Heat maps and voxels of halls: the pixels of each rack, and the voxels of its levels."""
+"""Raster data of halls for recordings: heat maps with a tile per rack, and 3D voxels of racks."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F32, I64, Reals
 
 TEMPERATURE_RESOLUTION_K = 1 / 16
-"""Resolution of temperatures: exact in half precision below 64 C, and it compresses well."""
+"""Step to which recorded temperatures are rounded, in K.
+
+Half precision represents multiples of this step exactly below 64 C, and they compress well.
+"""
 TEMPERATURE_RANGES_C = {"inlet": (10.0, 45.0), "outlet": (10.0, 60.0)}
-"""Ranges of the colours by quantity, in C, so that colours mean the same in every recording."""
+"""Range of the colour map of each temperature, in C; fixed, so that recordings are comparable."""
 COLOURMAPS: dict[str, Literal["inferno", "viridis"]] = {
     "inlet": "inferno",
     "outlet": "inferno",
     "power": "viridis",
 }
-"""Colour maps by quantity, perceptually uniform and legible to people who are colour-blind."""
+"""Colour map of each quantity, perceptually uniform and legible with colour vision deficiency."""
 MAX_RACKS_WITH_GAPS = 5_000
-"""Number of racks up to which the tiles of a heat map have gaps between them."""
+"""Largest number of racks at which the tiles of a heat map have gaps between them."""
 MAX_RACKS_OF_SMALL_HALL = 200
-"""Number of racks up to which a hall has the largest tiles, and the most levels in 3D."""
+"""Largest number of racks at which a hall has tiles of full size and all levels in 3D."""
 
 
 class ColourScale(NamedTuple):
-    """Range and resolution of the values that a heat map shows."""
+    """Range, resolution and unit of the values that a heat map shows."""
 
     low: float
     """Value at the lower end of the colour map, in ``unit``."""
@@ -42,7 +45,7 @@ class ColourScale(NamedTuple):
 
 
 def temperature_scale(quantity: str) -> ColourScale:
-    """Colour scale of a temperature.
+    """Return the colour scale of a rack temperature, in C.
 
     Args:
         quantity: ``inlet`` or ``outlet``.
@@ -51,10 +54,11 @@ def temperature_scale(quantity: str) -> ColourScale:
 
 
 def power_scale(fleet: Fleet) -> ColourScale:
-    """Colour scale of rack power: 0 to the largest nameplate power and a tenth for fans, in kW.
+    """Return the colour scale of rack power, in kW.
 
-    The upper end is rounded up to 1, 2 or 5 times a power of ten; the resolution is the power of
-    two that half precision holds exactly over this range.
+    The range begins at 0. Its upper end is 1.1 times the largest nameplate power of a rack (a
+    tenth for fans), rounded up to 1, 2 or 5 times a power of ten. The resolution is a power of two
+    whose multiples half precision represents exactly over this range.
     """
     nameplate_w = np.concatenate([count * full_w for count, full_w, *_ in fleet.group_rows])
     largest_kw = float(fleet.group_sums(nameplate_w).max()) * 1.1 / 1e3
@@ -64,9 +68,10 @@ def power_scale(fleet: Fleet) -> ColourScale:
 
 
 def quantised(values: Reals, scale: ColourScale) -> F32:
-    """Values rounded to the resolution of a scale and limited to its range, of the same shape.
+    """Round values to the resolution of a scale, and clip them to its range.
 
-    The viewer in a browser draws what is below the range, or nan, as hot.
+    Values are clipped because the Rerun web viewer draws values below the range in the hottest
+    colour.
     """
     steps = np.rint(values.astype(np.float32) * np.float32(1.0 / scale.resolution))
     rounded = np.clip(steps * np.float32(scale.resolution), scale.low, scale.high)
@@ -74,7 +79,10 @@ def quantised(values: Reals, scale: ColourScale) -> F32:
 
 
 class TileGrid(NamedTuple):
-    """Heat map of a hall: rows of the hall downwards, racks of a row to the right, a tile each."""
+    """Geometry of a heat map of a hall, with a tile per rack.
+
+    Rows of the hall run down the image, and the racks of a row run to the right.
+    """
 
     rows: int
     """Number of rows of the hall."""
@@ -97,7 +105,10 @@ class TileGrid(NamedTuple):
 
 
 def tile_grid(hall: HallConfig) -> TileGrid:
-    """Tiles shaped so that a hall is about 1.8 times as wide as high (tiles at most 8:1)."""
+    """Return tiles with which a heat map is about 1.8 times as wide as high.
+
+    Tiles are at most 8 times as wide as high, or as high as wide.
+    """
     ratio = min(max(1.8 * hall.rows / hall.racks_per_row, 1 / 8), 8.0)
     has_gaps = hall.racks <= MAX_RACKS_WITH_GAPS
     short_side = 4 if hall.racks <= MAX_RACKS_OF_SMALL_HALL else 2 if has_gaps else 1
@@ -111,19 +122,20 @@ def tile_grid(hall: HallConfig) -> TileGrid:
 
 
 def heat_maps(rack_values: Reals, grid: TileGrid, scale: ColourScale) -> npt.NDArray[np.float16]:
-    """Heat maps of rack values; gaps have the lower end of the range.
+    """Return heat maps of rack values, one per frame; gaps have the lower end of the range.
 
     Args:
-        rack_values: a value per frame and rack, (T, R).
-        grid: tiles of the hall.
+        rack_values: value of each of T frames and R racks, (T, R).
+        grid: geometry of the tiles.
         scale: range and resolution of the values.
 
     Returns:
-        Pixels, (T, height, width).
+        Values of the pixels, (T, height, width).
     """
     rows, per_row, height, width, gap = grid
     frames, racks = rack_values.shape
-    # A value for the gaps follows those of the racks, and a line of gaps those of the rows.
+    # Gaps are looked up like racks: index ``racks`` is the value of gaps, and index ``rows`` is
+    # an image line that consists of gaps.
     values = np.full((frames, racks + 1), scale.low, dtype=np.float16)
     values[:, :racks] = quantised(rack_values, scale)
     rack_of_pixel = np.full((rows + 1, per_row, width + gap), racks)
@@ -136,13 +148,14 @@ def heat_maps(rack_values: Reals, grid: TileGrid, scale: ColourScale) -> npt.NDA
 
 
 def colour_bar(scale: ColourScale) -> tuple[F32, list[float]]:
-    """Image of a colour bar and the values to mark on it.
+    """Return the image of a colour bar, and the values of its tick marks.
 
     Args:
-        scale: range of the bar.
+        scale: range of the colour bar.
 
     Returns:
-        A gradient over the range, (height, width), and at most nine round values within it.
+        A horizontal gradient over the range, (height, width), and at most nine round values within
+        the range.
     """
     width, height = 240, 10
     gradient = np.tile(np.linspace(scale.low, scale.high, width, dtype=np.float32), (height, 1))
@@ -155,33 +168,33 @@ def colour_bar(scale: ColourScale) -> tuple[F32, list[float]]:
 
 
 class RackVoxels(NamedTuple):
-    """Racks as voxels of half a rack's depth, so that a rack has a front and a back.
+    """Racks as voxels of half a rack's depth: a front and a back voxel per level of each rack.
 
-    Voxels lie on one grid, so aisles are rounded to half a rack's depth.
+    All voxels are on one grid, which rounds the widths of aisles to half a rack's depth.
     """
 
     size_m: tuple[float, float, float]
     """Size of a voxel along the row, across the row and upwards, in m."""
     front: I64
-    """Grid indices x, y, z of the fronts, rack by rack from the floor up, (R levels, 3)."""
+    """Grid indices x, y, z of front voxels, rack by rack from the floor up, (R * levels, 3)."""
     back: I64
-    """Grid indices x, y, z of the backs, rack by rack from the floor up, (R levels, 3)."""
+    """Grid indices x, y, z of back voxels, rack by rack from the floor up, (R * levels, 3)."""
     levels: int
-    """Number of equal heights that a rack is cut into."""
+    """Number of levels of equal height per rack."""
 
 
 def rack_voxels(hall: HallConfig, levels: int) -> RackVoxels:
-    """Voxels of the racks of a hall.
+    """Return the voxels of the racks of a hall.
 
     Args:
-        hall: the hall of R racks.
-        levels: number of equal heights that a rack is cut into.
+        hall: config of the hall, with R racks.
+        levels: number of levels of equal height per rack.
     """
     plan, measures = floor_plan(hall), hall.layout
     half_m = measures.rack_depth_m / 2
     x = np.tile(np.arange(hall.racks_per_row), hall.rows)
     low = np.rint((plan.centre_m[:, 1] - half_m) / half_m).astype(np.int64)
-    # The front is the half with larger y where racks face that way.
+    # The front is the half with larger y in racks that face towards larger y.
     ahead = (plan.facing > 0).astype(np.int64)
     z = np.arange(levels)
 
@@ -198,11 +211,13 @@ def rack_voxels(hall: HallConfig, levels: int) -> RackVoxels:
 
 
 def level_starts(servers: I64, levels: int) -> I64:
-    """First server of each level of racks, counted over the servers of all of them, (R levels,).
+    """Return the index of the first server of each level of each rack, (R * levels,).
+
+    Indices count the servers of all racks, rack by rack from the floor up.
 
     Args:
         servers: number of servers of each rack, (R,), at least one per level.
-        levels: number of equal heights that a rack is cut into.
+        levels: number of levels of equal height per rack.
     """
     first = np.cumsum(servers) - servers
     # Server j of n is in level j * levels // n.

@@ -1,8 +1,8 @@
 """Shared parts of all pictures: colours, figures, axes and texts.
 
-pyplot is not used, so no window or global state is touched. Colours are those of Okabe and Ito
-(2008), "Color Universal Design", and the maps inferno, viridis and cividis, which readers with
-colour vision deficiency can distinguish.
+The package does not use pyplot, so it opens no window and changes no global state. Readers with
+colour vision deficiency can distinguish the colours, which are those of Okabe and Ito (2008),
+"Color Universal Design", and the colour maps inferno, viridis and cividis.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 DPI = 100
 """Default resolution of pictures, in pixels per inch."""
 MAX_LABELLED_RACKS = 60
-"""Number of racks up to which the racks of a hall show their values as numbers."""
+"""Largest number of racks of a hall whose racks show their values as numbers."""
 MIN_COLOUR_RANGE_K = 2.0
-"""Smallest range of a colour bar, in K, so that differences of a few tenths look small."""
+"""Smallest range of a colour bar of temperatures, in K; it keeps tenths of a kelvin faint."""
 MAX_NAME_LENGTH = 50
 """Largest number of characters of a name in a picture."""
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"
 LINE_COLOURS = (BLUE, ORANGE, GREEN, RED, PINK, SKY, "black", "#B8A800")
-"""Colours of lines in their order of use; the yellow is darkened for white paper."""
+"""Colours of the lines of a plot in their order of use; the yellow is darkened for white paper."""
 LINE_STYLES = ("-", "--", ":", "-.")
-"""Dashes of lines, changed when all colours are used."""
+"""Dash styles; ``line_style`` takes the next one each time all colours have been used."""
 DAY = np.timedelta64(1, "D")
 """Length of a day."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure of ``DPI``.
+    """Return an empty figure with the resolution ``DPI``.
 
     Raises:
         SdcError: matplotlib is missing.
@@ -65,14 +65,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
-    """Draw a figure as a lossless WebP, two thirds of the size of a PNG.
+    """Encode a figure as a lossless WebP image, which has two thirds of the size of a PNG.
 
     Args:
         figure: the figure.
-        dpi: pixels per inch.
+        dpi: resolution, in pixels per inch.
 
     Returns:
-        Width and height in pixels, and the content of the file.
+        Width and height of the image in pixels, and the bytes of the WebP file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
@@ -88,12 +88,12 @@ def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
 
 
 def save_picture(figure: Figure, path: Path, *, parents: bool = False) -> None:
-    """Write a figure to a file, whole or not at all.
+    """Write a figure to a file atomically; after an error no partial file remains.
 
     Args:
         figure: the figure.
-        path: the file; its suffix says the format.
-        parents: also create the folders it lies in.
+        path: path of the file, whose suffix is the format, such as ``.png``.
+        parents: True to create missing parent folders.
 
     Raises:
         SdcError: the file cannot be written.
@@ -104,58 +104,60 @@ def save_picture(figure: Figure, path: Path, *, parents: bool = False) -> None:
 
 @contextlib.contextmanager
 def _without_glyph_warnings() -> Iterator[None]:
-    """Have characters that the font lacks drawn as boxes without a warning for each."""
+    """Suppress matplotlib's warnings about characters that the font lacks; they show as boxes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph ")
         yield
 
 
 def add_title(figure: Figure, text: str) -> None:
-    """Write a title above a figure at the left, literally; an empty one takes no room."""
+    """Add a left-aligned title above a figure, without math mode; an empty title adds nothing."""
     if text:
         figure.suptitle(text.replace("$", r"\$"), x=0.01, ha="left")
 
 
 def short_name(name: str) -> str:
-    """A name on one line of at most ``MAX_NAME_LENGTH`` characters."""
+    """Return a name on one line, cut to ``MAX_NAME_LENGTH`` characters."""
     line = printable(" ".join(name.split()))
     return line if len(line) <= MAX_NAME_LENGTH else line[: MAX_NAME_LENGTH - 1] + "…"
 
 
 def literal_text(name: str) -> str:
-    """A short name that matplotlib writes unchanged.
+    """Return a shortened name that matplotlib prints unchanged.
 
-    matplotlib reads formulas between dollar signs and hides legends that begin with "_".
+    matplotlib otherwise reads text between dollar signs as a formula, and hides legend entries
+    that begin with "_".
     """
     line = short_name(name)
     return (" " if line.startswith("_") else "") + line.replace("$", r"\$")
 
 
 def format_number(value: float) -> str:
-    """A value with four significant digits, or whole with separators from 1000 on."""
+    """Return a number with four significant digits, or from 1000 on as an integer with commas."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"
 
 
 def date_text(moment: datetime, *, over_a_year: bool) -> str:
-    """Day and month of a time.
+    """Return day and month of a time, such as ``1 July``.
 
     Args:
         moment: the time.
-        over_a_year: whether the run is longer than a year; then the text names the year too.
+        over_a_year: True if the run is longer than a year; the text then includes the number of
+            the year in the run.
     """
     year = f" (year {moment.year - FIRST_YEAR + 1})" if over_a_year else ""
     return f"{moment.day} {moment:%B}{year}"
 
 
 def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
-    """Check that a DataFrame holds the steps of one data center.
+    """Check that a DataFrame contains the steps of one data center.
 
     Args:
         steps: one row per step.
-        columns: names of the columns that it must have.
+        columns: names of the required columns.
 
     Raises:
-        SdcError: a column is missing, fewer than two rows, or times that do not increase.
+        SdcError: a column is missing, there are fewer than two rows, or the times do not increase.
     """
     missing = [name for name in columns if name not in steps.columns]
     if missing:
@@ -169,19 +171,20 @@ def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
 
 
 def is_over_a_year(steps: pd.DataFrame) -> bool:
-    """Whether a run is longer than a year, so that its days occur more than once."""
+    """Return True if a run is longer than a year, so that a calendar day can occur twice."""
     return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * DAY)
 
 
 def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
-    """First row of a day, and the first row after it.
+    """Return the index of the first row of a day, and of the first row after that day.
 
     Args:
         steps: steps of the data center.
-        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
+        date: ``MM-DD`` for the first such day of the run, or ``YYYY-MM-DD`` with the year that
+            the column ``time`` has on that day.
 
     Raises:
-        SdcError: the run does not have the day.
+        SdcError: the run does not contain the day.
     """
     days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
     names = [str(each) for each in days]
@@ -197,61 +200,70 @@ def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
 
 
 def step_edges(steps: pd.DataFrame) -> npt.NDArray[np.datetime64]:
-    """Beginnings of n steps and the end of the last, (n + 1,); n of two or more."""
+    """Return the begin of each of n >= 2 steps and the end of the last one, (n + 1,)."""
     times: npt.NDArray[np.datetime64] = steps["time"].to_numpy()
-    # The shortest, because the clock skips 29 February.
+    # The length of a step is the smallest difference, because the clock skips 29 February.
     return np.append(times, times[-1] + np.diff(times).min())
 
 
 def step_hours(steps: pd.DataFrame) -> float:
-    """Length of the steps, in h."""
+    """Return the length of a step, in h."""
     return float(np.diff(steps["time"].to_numpy()).min() / np.timedelta64(1, "h"))
 
 
 def repeat_last(values: npt.ArrayLike) -> F64:
-    """Values of n steps with the last repeated, to draw them to its end, (n + 1,)."""
+    """Return the values of n steps with the last one repeated, (n + 1,).
+
+    The repeated value lets a step plot extend to the end of the last step.
+    """
     array = np.asarray(values, dtype=np.float64)
     return np.append(array, array[-1])
 
 
 def scale_thousands(values: F64, unit: str, thousands: str) -> tuple[F64, str]:
-    """Values with their unit, or in thousands with that unit if one of them reaches a thousand."""
+    """Return values and their unit, divided by 1000 if the largest value reaches 1000.
+
+    Args:
+        values: the values.
+        unit: unit of the values, such as ``kWh``.
+        thousands: unit of a thousand, such as ``MWh``.
+    """
     return (values / 1e3, thousands) if values.max() >= 1e3 else (values, unit)
 
 
 def colour_range(values: F64) -> tuple[float, float]:
-    """Range of temperatures for colours, at least ``MIN_COLOUR_RANGE_K`` wide."""
+    """Return the ends of a colour map for temperatures, at least ``MIN_COLOUR_RANGE_K`` apart."""
     middle = (values.min() + values.max()) / 2
     half = max((values.max() - values.min()) / 2, MIN_COLOUR_RANGE_K / 2)
     return float(middle - half), float(middle + half)
 
 
 def line_style(index: int) -> dict[str, Any]:
-    """Colour and dashes of one of many lines, different for the first 32."""
+    """Return colour and dash style of a line; they differ for the first 32 indices."""
     colours = len(LINE_COLOURS)
     dashes = LINE_STYLES[index // colours % len(LINE_STYLES)]
     return {"color": LINE_COLOURS[index % colours], "linestyle": dashes}
 
 
 def draw_steps(axes: Axes, steps: pd.DataFrame, values: npt.ArrayLike, **style: Any) -> None:
-    """Draw a line that is level over each step.
+    """Draw values as a line that is constant during each step.
 
     Args:
-        axes: where to draw.
+        axes: axes to draw in.
         steps: steps of one data center.
-        values: a value per step.
-        style: properties of the line.
+        values: one value per step.
+        style: matplotlib properties of the line.
     """
     style = {"linewidth": 1.4} | style
     axes.plot(step_edges(steps), repeat_last(values), drawstyle="steps-post", **style)
 
 
 def draw_rack_grid(axes: Axes, grid: F64, cmap: str, limits: tuple[float, float]) -> QuadMesh:
-    """Draw racks as a grid, row 0 on top, racks of a row to the right.
+    """Draw one coloured cell per rack, with row 0 on top and the racks of a row to the right.
 
     Args:
-        axes: where to draw.
-        grid: values, (rows, racks per row).
+        axes: axes to draw in.
+        grid: value of each rack, (rows, racks per row).
         cmap: name of the colour map.
         limits: values at the ends of the colour map.
     """
@@ -274,14 +286,16 @@ def draw_rack_grid(axes: Axes, grid: F64, cmap: str, limits: tuple[float, float]
 
 
 def outline_hottest(axes: Axes, grid: F64) -> str:
-    """Outline the hottest racks of a small hall, or ring the first one of a large hall.
+    """Outline the hottest racks of a small hall, or circle the first of them in a large hall.
+
+    Nothing is marked if all racks are equally hot.
 
     Args:
-        axes: axes with the racks as a grid.
-        grid: temperatures in C, (rows, racks per row).
+        axes: axes in which ``draw_rack_grid`` drew the racks.
+        grid: temperature of each rack, in C, (rows, racks per row).
 
     Returns:
-        The place of the hottest rack in words.
+        Row and rack of the hottest rack, as text.
     """
     from matplotlib.patches import Rectangle
 
@@ -299,19 +313,19 @@ def outline_hottest(axes: Axes, grid: F64) -> str:
 
 
 def remove_frame(axes: Axes) -> None:
-    """Give axes a grid in place of a frame."""
+    """Replace the frame of axes by a grid."""
     axes.spines[:].set_visible(False)
     axes.grid(alpha=0.25)
 
 
 def style_axes(axes: Axes) -> None:
-    """Give axes a grid in place of a frame, and let curves run from edge to edge."""
+    """Replace the frame of axes by a grid, and remove the horizontal margins beside the curves."""
     axes.margins(x=0)
     remove_frame(axes)
 
 
 def style_axes_with_legend(axes: Axes) -> None:
-    """Give axes a grid in place of a frame, and a legend above."""
+    """Replace the frame of axes by a grid, and add a legend above the axes."""
     style_axes(axes)
     axes.legend(
         loc="lower left",
@@ -329,7 +343,8 @@ def format_time_axis(axes: Axes) -> None:
     """Label a time axis with days and hours, without the year, which is a placeholder."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-    # With fewer or more at least, it finds no interval for 4 to 5 days, and warns.
+    # With another minimum number of ticks the locator warns that it finds no interval for runs of
+    # 4 to 5 days.
     locator = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
     formats = ["%b", "%b", "%d %b", "%H:%M", "%H:%M", "%H:%M:%S"]
     axes.xaxis.set_major_locator(locator)
@@ -345,12 +360,12 @@ def format_time_axis(axes: Axes) -> None:
 
 
 def format_day_axis(axes: Axes, steps: pd.DataFrame, *, over_a_year: bool) -> None:
-    """Let a time axis span the day of some steps, and name the day.
+    """Set the time axis to the day of the steps, and put the date into its label.
 
     Args:
-        axes: axes with the time to the right.
+        axes: axes whose x axis is the time.
         steps: steps of one day.
-        over_a_year: whether the run is longer than a year.
+        over_a_year: True if the run is longer than a year.
     """
     from matplotlib.dates import DateFormatter, HourLocator
 
