@@ -1,4 +1,7 @@
-"""Blocks of results: the data centers in focus in full, and sums over the fleet."""
+"""Blocks of step results for a recording.
+
+A block contains all series of the data centers in focus, and sums and maxima over the fleet.
+"""
 
 from __future__ import annotations
 
@@ -34,28 +37,33 @@ if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
 
 MAX_BLOCK_STEPS, MAX_BLOCK_BYTES = 1_024, 16_000_000
-"""Steps and bytes from which a block, which is held in memory, is written."""
+"""Number of steps and of bytes at which the block in memory is written to the recording."""
 MAP_EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0), (np.inf, 6.0))
-"""Largest number of racks in focus, and the hours between two heat maps, 0 being every step."""
+"""Interval of heat maps in h, by the largest number of racks in focus; 0 h is every step."""
 HALL_EVERY_H, HALL_EVERY_H_IN_EVENTS = 3.0, 1.0
-"""Least time between two frames of the 3D hall, which need a pass over all servers, in h."""
+"""Smallest interval of frames of the 3D hall, in h, without and with an active event.
+
+The interval is long because each frame reads the temperatures of all servers.
+"""
 SMALL_HALL_LEVELS, LARGE_HALL_LEVELS = 10, 5
-"""Levels of a rack of the 3D hall, in small and in larger halls."""
+"""Largest number of levels per rack of the 3D hall, for small halls and for larger ones."""
 MAX_SERVERS_IN_LEVELS = 100_000
-"""Number of servers of the fleet up to which the levels of a rack show its servers."""
+"""Largest number of servers of a fleet whose 3D halls show servers in the levels of a rack."""
 _UNREDUCED_BYTES = 4_000_000
-"""Size of the results that wait until they are reduced to the data centers in focus; it fits into
-the cache that processors share."""
+"""Size of buffered step results, in bytes, at which they are reduced to what a block contains.
+
+Results of this size fit into the last-level cache of the processor.
+"""
 
 
 def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) -> Cadence:
-    """Cadence for the halls in focus.
+    """Return how often and how finely the halls in focus are recorded.
 
     Args:
         fleet: the fleet.
         focus: indices of the data centers in focus.
-        every_steps: steps between two heat maps and between two frames of the 3D hall; None
-            follows the number of racks in focus.
+        every_steps: interval of heat maps and of frames of the 3D hall, in steps; None derives it
+            from the number of racks in focus.
     """
     racks = int(np.diff(fleet.rack_offsets)[focus].sum())
     map_every_h = next(hours for most, hours in MAP_EVERY_H if racks <= most)
@@ -80,50 +88,54 @@ def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) 
 
 
 def _servers_of_racks(fleet: Fleet, dc: int) -> I64:
-    """Number of servers of each rack of a data center, (R,)."""
+    """Return the number of servers of each of the R racks of a data center, (R,)."""
     first, last = fleet.rack_offsets[dc : dc + 2]
     return np.diff(fleet.server_offsets[fleet.group_offsets[first : last + 1]]).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """T steps of n data centers in focus, with R racks and U CRAC units, end to end."""
+    """Recorded values of T consecutive steps of n data centers in focus.
+
+    The data centers in focus have R racks and U CRAC units in all, concatenated in the order of
+    the focus.
+    """
 
     steps: I64
     """Steps, counted from 0 at reset, (T,)."""
     size_bytes: int
-    """Size of the recorded block, about."""
+    """Approximate size of the recorded block, in bytes."""
     values: F64
-    """Values of ``FIELDS`` and PUE, F in all, in their units, (T, F, n)."""
+    """Values of the F quantities ``FIELDS`` and PUE, each in its own unit, (T, F, n)."""
     fleet: dict[str, F64]
-    """Series over all data centers, see ``fleet_series``, (T,) each."""
+    """Series of the whole fleet by name, (T,) each, see ``fleet_series``."""
     queue_by_age: F64
-    """Queued work by age band, in tasks, (T, n, bands)."""
+    """Queued work in each age band, in tasks, (T, n, bands)."""
     unit_supply_c: F64
-    """Supply air of the CRAC units, in C, (T, U)."""
+    """Supply air temperature of the CRAC units, in C, (T, U)."""
     unit_flow_m3s: F64
     """Airflow of the CRAC units, in m3/s, (T, U)."""
     rewards: F64 | None
-    """Reward terms, (T, terms, n); None without any."""
+    """Reward terms, (T, terms, n); None if no rewards are recorded."""
     map_steps: I64
-    """Steps with heat maps, (M,)."""
+    """Steps of the M heat maps, (M,)."""
     maps: dict[str, Reals]
-    """Values of the racks by quantity: inlet and outlet in C, power in kW, (M, R) each."""
+    """Rack values of heat maps, (M, R), by quantity: inlet and outlet in C, power in kW."""
     hall_steps: I64
-    """Steps with frames of the 3D hall, (H,)."""
+    """Steps of the H frames of the 3D hall, (H,)."""
     halls: dict[str, Reals]
-    """Inlets and outlets of the levels of all racks from the floor up, in C, (H, levels) each."""
+    """Inlet and outlet of each level of each rack, floor to top, in C, (H, levels) each."""
     entries: list[LogEntry]
-    """Entries of the log, step by step."""
+    """Entries of the event log, ordered by step."""
 
 
 class BlockBuilder:
-    """Collects the results of a simulator until they are taken as a block.
+    """Collects the step results of a simulator until ``take`` returns them as a block.
 
     Args:
-        sim: the simulator that makes the results.
+        sim: the simulator whose results are recorded.
         focus: indices of the data centers in focus.
-        cadence: how often heat maps and 3D halls are recorded.
+        cadence: how often and how finely heat maps and 3D halls are recorded.
     """
 
     def __init__(self, sim: Simulator, focus: Sequence[int], cadence: Cadence) -> None:
@@ -133,26 +145,26 @@ class BlockBuilder:
         self._read = operator.attrgetter(*FIELDS)
         self._age_edges = np.array(AGE_EDGES_H) * fleet.steps_per_hour
         self._pick_racks, self.racks = _pick(fleet.rack_offsets, focus)
-        """Indices of the racks in focus, and the place of each data center among these."""
+        """Fleet indices of the racks in focus, and each data center's slice of these racks."""
         self._pick_units, self.units = _pick(fleet.unit_offsets, focus)
-        """Indices of the CRAC units in focus, and the place of each data center among these."""
+        """Fleet indices of the CRAC units in focus, and each data center's slice of these units."""
         if cadence.has_servers:
             first_servers = fleet.server_offsets[fleet.group_offsets[fleet.rack_offsets]]
             self._pick_servers, parts = _pick(first_servers, focus)
-            """Indices of the servers in focus."""
+            """Fleet indices of the servers in focus."""
             self._level_starts = np.concatenate([
                 part.start + rasters.level_starts(_servers_of_racks(fleet, dc), levels)
                 for part, dc, levels in zip(parts, focus, cadence.levels, strict=True)
             ])  # fmt: skip
-            """First server of each level of the racks in focus, counted among these."""
+            """Index into the servers in focus of the first server of each level of each rack."""
         shapes = [rasters.tile_grid(fleet.configs[dc].hall).image_shape for dc in focus]
         self._map_bytes = 2 * len(rasters.COLOURMAPS) * sum(map(math.prod, shapes))
         racks = np.diff(fleet.rack_offsets)[self._focus]
         ends = np.cumsum([0, *(racks * cadence.levels)]).tolist()
         self.levels = list(itertools.starmap(slice, itertools.pairwise(ends)))
-        """Place of each data center in focus among the levels of all racks."""
+        """Slice of each data center in focus in the array of the levels of all racks in focus."""
         self.reward_names: tuple[str, ...] | None = None
-        """Names of the reward terms, known from the first step on."""
+        """Names of the reward terms; None before the first step."""
         self._last_step = -1
         self._last_status = bytes(fleet.racks)
         self._has_events = any(
@@ -162,7 +174,7 @@ class BlockBuilder:
         self._clear()
 
     def _clear(self) -> None:
-        """Begin a block."""
+        """Empty all buffers to begin a new block."""
         self._steps: list[int] = []
         self._bytes = 0
         self._unreduced: list[tuple[npt.NDArray[Any], ...]] = []
@@ -175,24 +187,24 @@ class BlockBuilder:
 
     @property
     def steps(self) -> int:
-        """Number of steps in the block under way."""
+        """Number of steps in the current block."""
         return len(self._steps)
 
     @property
     def is_full(self) -> bool:
-        """Whether the block under way is to be written."""
+        """True if the current block has reached its size limit and must be written."""
         return self.steps >= MAX_BLOCK_STEPS or self._bytes >= MAX_BLOCK_BYTES
 
     def add(self, result: StepResult, rewards: Mapping[str, F64] | None) -> None:
-        """Add a step to the block under way.
+        """Add a step to the current block.
 
         Args:
             result: result of the step.
-            rewards: reward terms by name, (B,) each.
+            rewards: reward terms by name, (B,) each; None if there are none.
 
         Raises:
-            SdcError: the result is of another simulator or does not follow the one before, or the
-                rewards have other names than before or are not one value per data center.
+            SdcError: the result is of another simulator or does not follow the previous step, or
+                the rewards have other names than in the first step or a shape other than (B,).
         """
         self._check(result)
         terms = rewards or {}
@@ -206,7 +218,8 @@ class BlockBuilder:
             (fields, queue, result.unit_supply_c, result.unit_flow_m3s, *terms.values())
         )
         step = self._last_step = result.step
-        # Only steps and frames that are listed count, should an interruption come in between.
+        # ``_steps``, ``_map_steps`` and ``_hall_steps`` are extended last: if an interruption falls
+        # in between, ``take`` discards data without an entry in these lists.
         self._steps.append(step)
         self._bytes += 8 * len(FIELDS) * (len(self._focus) + 2)
         self._add_events(result)
@@ -220,7 +233,7 @@ class BlockBuilder:
             self._reduce()
 
     def take(self) -> Block:
-        """Return the block under way and begin another."""
+        """Return the current block and begin a new one."""
         if self._unreduced:
             self._reduce()
         values, sums, hottest_c, queue_by_age, supply_c, flow_m3s, *rewards = (
@@ -246,7 +259,7 @@ class BlockBuilder:
         return block
 
     def _reduce(self) -> None:
-        """Reduce the results that wait to data centers in focus and sums over the fleet."""
+        """Reduce the buffered results to the data centers in focus and to values of the fleet."""
         fields, queues, supply_c, flow_m3s, *rewards = map(
             np.stack, zip(*self._unreduced, strict=True)
         )
@@ -264,7 +277,7 @@ class BlockBuilder:
         self._unreduced = []
 
     def _check(self, result: StepResult) -> None:
-        """Refuse a result of another simulator, or one that does not follow the last one."""
+        """Raise ``SdcError`` for a result of another simulator or not of the next step."""
         dcs, racks, fleet = len(result.it_w), len(result.rack_inlet_c), self._fleet
         if (dcs, racks) != (fleet.size, fleet.racks):
             raise SdcError(
@@ -284,7 +297,10 @@ class BlockBuilder:
             )
 
     def _check_rewards(self, terms: Mapping[str, F64]) -> None:
-        """Refuse reward terms of other names than in the first step, or of another shape."""
+        """Raise ``SdcError`` for reward terms with other names than in the first step, or shapes.
+
+        Each term must have the shape (B,).
+        """
         if tuple(terms) != self.reward_names:
             raise SdcError(
                 f"recorder: rewards {', '.join(terms) or 'none'}, expected "
@@ -298,7 +314,7 @@ class BlockBuilder:
                 )
 
     def _add_events(self, result: StepResult) -> None:
-        """Log failures, weather events and racks that changed their status."""
+        """Add log entries for failures, weather events and racks with a changed status."""
         step, fleet, status = result.step, self._fleet, result.rack_status.tobytes()
         if self._has_events:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
@@ -317,7 +333,7 @@ class BlockBuilder:
             )
 
     def _add_map(self, result: StepResult) -> None:
-        """Keep the values of the heat maps of a step."""
+        """Store the rack values of the heat maps of a step."""
         fields = result.rack_inlet_c, result.rack_outlet_c, result.rack_cpu_w, result.rack_fan_w
         inlet_c, outlet_c, cpu_w, fan_w = (
             values[self._pick_racks].astype(np.float32) for values in fields
@@ -327,7 +343,7 @@ class BlockBuilder:
         self._map_steps.append(result.step)
 
     def _add_hall(self, result: StepResult) -> None:
-        """Keep the values of the 3D halls of a step."""
+        """Store the level temperatures of the 3D halls of a step."""
         if self._cadence.has_servers:
             servers = self._sim.servers()
             layers = np.stack([servers.inlet_c, servers.outlet_c])[:, self._pick_servers]
@@ -340,12 +356,20 @@ class BlockBuilder:
 
 
 def _pick(offsets: npt.NDArray[np.integer[Any]], focus: Sequence[int]) -> tuple[I64, list[slice]]:
-    """Indices of the parts of the data centers in focus, and the place of each among these."""
+    """Return the indices of the parts (racks, units or servers) of the data centers in focus.
+
+    Args:
+        offsets: index of the first part of each data center of the fleet, then the total, (B + 1,).
+        focus: indices of the data centers in focus.
+
+    Returns:
+        Concatenated fleet indices of the parts, and each data center's slice of that array.
+    """
     parts = [np.arange(*offsets[dc : dc + 2]) for dc in focus]
     ends = np.cumsum([0, *map(len, parts)]).tolist()
     return np.concatenate(parts), list(itertools.starmap(slice, itertools.pairwise(ends)))
 
 
 def _by_quantity(names: Iterable[str], frames: Sequence[F32]) -> dict[str, F32]:
-    """Frames of each quantity, from an array with one row per quantity for each frame."""
+    """Return all frames of each quantity, stacked, from frames that have one row per quantity."""
     return dict(zip(names, np.stack(frames, axis=1), strict=True)) if frames else {}

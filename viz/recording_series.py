@@ -1,4 +1,4 @@
-"""Series of a recording: the quantities of ``StepResult`` that it holds, and their plots."""
+"""Series of a recording: the recorded quantities of ``StepResult``, and their plots."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from sdc_taichi.types import F64, QUANTITIES
 
-# Colours of Okabe and Ito, which stay apart for people who are colour-blind (Okabe, Ito: Color
-# Universal Design, 2008). Black is a grey here, since the viewer's ground is dark.
+# Colours that readers with colour vision deficiency can distinguish (Okabe and Ito, Color Universal
+# Design, 2008). Grey replaces their black, because the viewer has a dark background.
 BLUE, ORANGE, GREEN, RED = 0x0072B2FF, 0xE69F00FF, 0x009E73FF, 0xD55E00FF
 PINK, SKY, YELLOW, GREY = 0xCC79A7FF, 0x56B4E9FF, 0xF0E442FF, 0x999999FF
 PALETTE = (BLUE, ORANGE, GREEN, RED, PINK, SKY, YELLOW, GREY)
 """Colours of lines without a fixed colour, in their order of use, as 0xRRGGBBAA."""
 
 AGE_EDGES_H = (0.0, 6.0, 12.0, 24.0)
-"""Lower edges of the age bands of the queue, in h; the last band has no upper edge."""
+"""Lower edges of the age bands of queued tasks, in h; the last band has no upper edge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,22 +31,25 @@ class Cadence:
     hall_every_steps_in_events: int
     """Steps between two frames of the 3D hall while a failure or weather event lasts."""
     levels: tuple[int, ...]
-    """Levels per rack of the 3D hall of each data center in focus."""
+    """Number of levels per rack of the 3D hall, for each data center in focus."""
     has_servers: bool
-    """Whether levels show servers; else a rack shows its hottest inlet and its mean outlet."""
+    """True if each level shows the hottest of its servers.
+
+    Otherwise a rack has one level, which shows its hottest inlet and its mean outlet.
+    """
 
 
 class Plot(NamedTuple):
-    """Lines of one unit, which are one entity of the recording."""
+    """A plot whose lines have the same unit and are one entity of the recording."""
 
     title: str
     """Title of the plot."""
     unit: str
-    """Unit of the lines, which titles and names show in brackets."""
+    """Unit of the lines, which title and legend show in brackets."""
     lines: tuple[tuple[str, str, int], ...]
-    """Name, quantity of ``StepResult`` and colour, as 0xRRGGBBAA, of each line of the legend."""
+    """Name in the legend, quantity of ``StepResult`` and colour (0xRRGGBBAA) of each line."""
     limits: tuple[float, float] | None = None
-    """Ends of the vertical axis; None follows the values."""
+    """Ends of the vertical axis; None scales the axis to the values."""
 
 
 PLOTS: dict[str, Plot] = {
@@ -140,17 +143,20 @@ PLOTS: dict[str, Plot] = {
         ),
     ),
 }
-"""Plots of a data center in focus, by entity, besides those of queue, CRAC units and rewards."""
+"""Plots of a data center in focus, keyed by entity.
+
+Plots of the queue, CRAC units and rewards are not included.
+"""
 
 QUEUE_ENTITY = "queue_tasks"
-"""Entity of the plot of queued work by age."""
+"""Entity of the plot of queued tasks by age."""
 QUEUE_COLOURS = (SKY, BLUE, ORANGE, RED)
-"""Colours of the age bands, the youngest first, as 0xRRGGBBAA."""
+"""Colours of the age bands of queued tasks, youngest first, as 0xRRGGBBAA."""
 QUEUE_NAMES = tuple(
     f"{low:g} h and older [tasks]" if high is None else f"{low:g} to {high:g} h [tasks]"
     for low, high in zip(AGE_EDGES_H, (*AGE_EDGES_H[1:], None), strict=True)
 )
-"""Names of the age bands in the legend, the youngest first."""
+"""Names of the age bands of queued tasks in the legend, youngest first."""
 REWARDS_ENTITY = "rewards"
 """Entity of the plot of reward terms."""
 
@@ -159,7 +165,10 @@ COMMAND_STATES: dict[str, tuple[str, tuple[str, str, str]]] = {
     "cooling": ("cooling_command", ("colder", "hold", "warmer")),
     "battery": ("battery_command", ("discharge", "idle", "charge")),
 }
-"""Commands as states, by entity: field of ``StepResult``, names below, at and above zero."""
+"""Commands that a recording shows as states, keyed by entity.
+
+Each has a field of ``StepResult``, and names of its values below zero, at zero and above zero.
+"""
 STATE_COLOURS = (BLUE, GREY, ORANGE)
 """Colours of a command below, at and above zero, as 0xRRGGBBAA."""
 
@@ -170,7 +179,7 @@ EVENT_FIELDS = (
     "unserved_kwh",
     "grid_overload_kwh",
 )
-"""Fields that the log of events needs besides those that are plotted."""
+"""Fields of ``StepResult`` that only the event log needs."""
 
 FLEET_SUMS = (
     "it_w",
@@ -183,7 +192,7 @@ FLEET_SUMS = (
     "throttled_racks",
     "tripped_racks",
 )
-"""Fields of which a recording holds the sum over all data centers of the fleet."""
+"""Fields of ``StepResult`` whose sums over all data centers of the fleet are recorded."""
 
 FIELDS: tuple[str, ...] = tuple(
     dict.fromkeys(
@@ -195,22 +204,25 @@ FIELDS: tuple[str, ...] = tuple(
         ]
     )
 )
-"""Quantities that are read of every step, ``FLEET_SUMS`` first."""
+"""Fields of ``StepResult`` that are recorded in every step, ``FLEET_SUMS`` first."""
 FIELD_ROWS = {field: row for row, field in enumerate((*FIELDS, "pue"))}
-"""Place of each quantity in ``FIELDS``; PUE, which follows from the powers, comes last."""
+"""Index of each quantity in ``FIELDS``, and after these the index of the PUE.
+
+The PUE is computed from the recorded powers.
+"""
 
 
 class FleetPlot(NamedTuple):
-    """A plot of one line over all data centers."""
+    """A plot with one line: a quantity of the whole fleet."""
 
     title: str
     """Title of the plot, with the unit in brackets."""
     colour: int
     """Colour of the line as 0xRRGGBBAA."""
     fields: tuple[str, ...]
-    """Entries of ``fleet_series`` that are added."""
+    """Names of the entries of ``fleet_series`` whose sum the line shows."""
     factor: float = 1.0
-    """Unit of the fields divided by the unit of the line."""
+    """Factor that converts the unit of the fields to the unit of the line."""
 
 
 FLEET_PLOTS: dict[str, FleetPlot] = {
@@ -227,27 +239,27 @@ FLEET_PLOTS: dict[str, FleetPlot] = {
         "racks throttled or off [-]", RED, ("throttled_racks", "tripped_racks")
     ),
 }
-"""Plots over all data centers of the fleet, by entity."""
+"""Plots of the whole fleet, keyed by entity."""
 
 
 def _pue(it_w: F64, overhead_w: F64) -> F64:
-    """(IT + overhead) / IT, nan without IT power, which a plot shows as a gap."""
-    some = it_w > 0
-    return np.where(some, 1.0 + overhead_w / np.where(some, it_w, 1.0), np.nan)
+    """Return the PUE, (IT + overhead) / IT; nan without IT power, so that its plot has a gap."""
+    has_it = it_w > 0
+    return np.where(has_it, 1.0 + overhead_w / np.where(has_it, it_w, 1.0), np.nan)
 
 
 def append_pue(values: F64) -> F64:
-    """Values of ``FIELDS``, (T, F, n), followed by the PUE, (T, F + 1, n)."""
+    """Append the PUE to values of the F quantities ``FIELDS``, (T, F, n) to (T, F + 1, n)."""
     pue = _pue(values[:, FIELD_ROWS["it_w"]], values[:, FIELD_ROWS["overhead_w"]])
     return np.concatenate([values, pue[:, None]], axis=1)
 
 
 def fleet_series(sums: F64, inlet_max_c: F64) -> dict[str, F64]:
-    """Series over all data centers by name, (T,) each, PUE among them.
+    """Return the series of the whole fleet by name, (T,) each: sums, hottest inlet and PUE.
 
     Args:
-        sums: sums of ``FLEET_SUMS`` over the data centers, (T, sums).
-        inlet_max_c: hottest inlet of all, in C, (T,).
+        sums: sums of the S fields ``FLEET_SUMS`` over all data centers, (T, S).
+        inlet_max_c: hottest inlet of all data centers, in C, (T,).
     """
     series = dict(zip(FLEET_SUMS, sums.T, strict=True))
     return {
@@ -258,11 +270,11 @@ def fleet_series(sums: F64, inlet_max_c: F64) -> dict[str, F64]:
 
 
 def line_factors(plot: Plot, step_h: float) -> F64:
-    """Factors from the units of ``QUANTITIES`` to the unit of a plot, (lines,).
+    """Return factors that convert the quantities of a plot to its unit, one per line, (lines,).
 
     Args:
         plot: the plot.
-        step_h: length of a step, in h, which turns energies into powers.
+        step_h: length of a step, in h, by which energies are divided to get powers.
     """
     to_unit = {("W", "kW"): 1e-3, ("kWh", "kW"): 1.0 / step_h, ("g CO2e", "kg/step"): 1e-3}
     units = ["1" if field == "pue" else QUANTITIES[field].unit for _, field, _ in plot.lines]
