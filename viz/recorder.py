@@ -1,4 +1,4 @@
-"""Recorder of the steps of a simulator, for the Rerun viewer."""
+"""Recorder that writes the steps of a simulator for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -29,26 +29,30 @@ if TYPE_CHECKING:
     from .recording_writer import RecordingWriter
 
 MAX_FOCUS, DEFAULT_FOCUS = 4, 2
-"""Largest number of data centers in focus, and the number of those taken by default."""
+"""Largest and default number of data centers in focus, which are recorded in full."""
 KEEP_BYTES, KEEP_BYTES_PER_VALUE, KEEP_BYTES_PER_DC = 8_000_000, 8, 20_000
-"""Bytes that a recording leaves free for the run folder: in all, per value and data center."""
+"""Disk space that a recording leaves free for the run folder, in bytes.
+
+The three terms are a constant, a size per value of the steps, and a size per data center.
+"""
 
 
 class Recorder:
-    """Writes step results to a Rerun recording, or to a viewer that shows them at once.
+    """Writes step results to a Rerun recording file, or to a viewer that shows them at once.
 
-    A file has its name from the first block on, and holds every whole block whatever ends the run;
-    ``close`` adds the index that readers find their way by. Once it cannot go on (a full disk, a
-    viewer that was closed) there is one ``RecordingWarning``, and further steps are ignored.
+    A file contains every complete block even if the run crashes; ``close`` adds the index of the
+    file. If the recording cannot continue (the disk is full, or the viewer was closed), the
+    recorder issues one ``RecordingWarning`` and ignores further steps; the simulation goes on.
 
     Args:
         path_or_address: file to write, ending in .rrd, or the address of a running viewer such as
-            rerun+http://127.0.0.1:9876/proxy; None with ``serve_port`` alone.
-        focus: names of up to 4 data centers to record in full; None is the first 2. The others
-            count in the fleet series. Data centers of equal names are called NAME#INDEX.
-        every: steps between two heat maps, and between two frames of the 3D hall; None follows the
-            number of racks in focus. Series always have every step.
-        serve_port: also let viewers connect to this port of 127.0.0.1; 0 picks a free one.
+            rerun+http://127.0.0.1:9876/proxy; None requires ``serve_port``.
+        focus: names of up to 4 data centers to record in full; None records the first 2. Other
+            data centers are included in the series of the fleet only. Data centers with the same
+            name are called NAME#INDEX.
+        every: interval of heat maps and of frames of the 3D hall, in steps; None derives it from
+            the number of racks in focus. Series always contain every step.
+        serve_port: port of 127.0.0.1 to which viewers can connect; 0 picks a free port.
 
     Raises:
         SdcError: rerun-sdk is missing, or an argument is not valid.
@@ -85,34 +89,34 @@ class Recorder:
 
     @property
     def file(self) -> Path | None:
-        """File of the present episode, or of the last one."""
+        """File of the current episode, or of the last one if none is open; None without a file."""
         if self._file is None or self._episodes < 2:
             return self._file
         return self._file.with_name(f"{self._file.stem}-{self._episodes}{self._file.suffix}")
 
     @property
     def served_address(self) -> str | None:
-        """Address that viewers connect to, if a port is served."""
+        """Address to which viewers can connect; None without ``serve_port``."""
         return None if self._port is None else served_at(self._port)
 
     @property
     def failed(self) -> bool:
-        """Whether the recording of the present episode has ended early, after a warning."""
+        """True if the recording of the current episode has ended early, after a warning."""
         return self._writer is not None and self._writer.failed
 
     def begin(self, sim: Simulator, description: Mapping[str, Any] | None = None) -> None:
-        """Begin to record an episode of a simulator, before its first step.
+        """Begin to record an episode of a simulator; call this before its first step.
 
-        An episode under way is closed. The first is written to the file that was named, the next to
-        NAME-2.rrd and so on; nothing is written before there is a step.
+        An open episode is closed. The first episode is written to NAME.rrd, the second to
+        NAME-2.rrd, and so on. An episode without steps writes nothing.
 
         Args:
-            sim: the simulator whose steps ``add`` takes.
-            description: result of ``describe_run``; None describes the simulator alone.
+            sim: the simulator whose step results are passed to ``add``.
+            description: result of ``describe_run``; None describes the simulator only.
 
         Raises:
-            SdcError: an unknown name in focus, a file that cannot be written or that another
-                process records to, or too little room on its disk.
+            SdcError: a name in focus is unknown, the file cannot be written, another process
+                records to the file, or its disk has too little space.
         """
         self.close()
         self._episodes += 1
@@ -123,13 +127,13 @@ class Recorder:
             raise
 
     def _new_writer(self, sim: Simulator, description: Mapping[str, Any] | None) -> RecordingWriter:
-        """The writer of an episode, and its output."""
+        """Create the writer of an episode, with its output."""
         from .recording_writer import RecordingWriter
 
         if description is None:
             unknown = ("controller", "seed")
-            known = describe_run(sim, RunRequest("", 0))
-            description = {name: value for name, value in known.items() if name not in unknown}
+            full = describe_run(sim, RunRequest("", 0))
+            description = {name: value for name, value in full.items() if name not in unknown}
         fleet = sim.fleet
         values = int(description.get("steps_asked", 0)) * fleet.size * len(fields(StepResult))
         keep_bytes = KEEP_BYTES + KEEP_BYTES_PER_VALUE * values + KEEP_BYTES_PER_DC * fleet.size
@@ -145,27 +149,28 @@ class Recorder:
         return RecordingWriter(sim, names, focus, description, output, self._every)
 
     def add(self, result: StepResult, *, rewards: Mapping[str, F64] | None = None) -> None:
-        """Add a step, right after it was done.
+        """Record the latest step of the simulator; call this before the next step.
 
         Args:
-            result: the result of the step.
-            rewards: reward terms by name, each (B,); of every step or of none.
+            result: result of the step.
+            rewards: reward terms by name, (B,) each. Either all steps of an episode or none have
+                rewards.
 
         Raises:
-            SdcError: there is no episode, the step is of another simulator, or it does not follow
-                the step before.
+            SdcError: no episode is open, the step is of another simulator, or it does not follow
+                the previous step.
         """
         if self._writer is None:
             raise SdcError("recorder: begin(sim) comes before the first step")
         self._writer.add(result, rewards)
 
     def flush(self) -> None:
-        """Write the steps that wait for their block to be complete."""
+        """Write the steps of the current, incomplete block."""
         if self._writer is not None:
             self._writer.flush()
 
     def close(self) -> None:
-        """Write the remaining steps; closing again does nothing."""
+        """Write the remaining steps and end the recording; further calls do nothing."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -181,13 +186,13 @@ class Recorder:
 
 
 def distinct_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of data centers, followed by # and their index where they are not distinct."""
+    """Return names of data centers with ``#INDEX`` appended to those that occur more than once."""
     counts = Counter(names)
     return tuple(n if counts[n] == 1 else f"{n}#{i}" for i, n in enumerate(names))
 
 
 def _check_focus(focus: Sequence[str]) -> tuple[str, ...]:
-    """Check and return the names of the data centers in focus, a list or a single name."""
+    """Check and return the names of the data centers in focus; a single name is valid too."""
     names = (focus,) if isinstance(focus, str) else focus
     are_names = isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
     if not (are_names and 0 < len(names) <= MAX_FOCUS and len(set(names)) == len(names)):
@@ -196,7 +201,7 @@ def _check_focus(focus: Sequence[str]) -> tuple[str, ...]:
 
 
 def _focus_indices(names: Sequence[str], focus: Sequence[str] | None) -> list[int]:
-    """Indices of the data centers in focus; None is the first few."""
+    """Return the indices of the data centers in focus; without names, those of the first few."""
     if focus is None:
         return list(range(min(len(names), DEFAULT_FOCUS)))
     for name in focus:

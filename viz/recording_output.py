@@ -1,7 +1,7 @@
-"""Send a recording to a file, to a viewer, or to viewers that connect here.
+"""Output of a recording: a file, a running viewer, or a port to which viewers connect.
 
-An output never stops or slows a simulation. The first failure causes one warning and ends the
-output; a file then ends with the last block that was written whole.
+An output never stops a simulation. The first failure causes one warning and ends the output; a
+file is then cut after its last complete block.
 """
 
 from __future__ import annotations
@@ -28,36 +28,40 @@ if TYPE_CHECKING:
     from rerun.chunk import Chunk
 
 DEFAULT_PORT = 9876
-"""Port on which Rerun viewers listen."""
+"""Default port of Rerun viewers."""
 HOST = "127.0.0.1"
-"""Address of this machine on which recordings are served; other machines cannot reach it."""
+"""Address on which recordings are served; only programs on the same machine can connect to it."""
 SCHEMES = ("rerun", "rerun+http", "rerun+https")
 """Schemes of the addresses of Rerun viewers."""
 PROBE_S = 0.5
-"""Time to wait for the port of a viewer, in s."""
+"""Longest time to wait for a connection to the port of a viewer, in s."""
 FILE_BLOCK_S = 5.0
 """Longest time that a file system may take to write one block, in s."""
 MAX_UNSENT_BYTES = 256_000_000
-"""Bytes that may wait for a slow viewer. With more, one last wait decides whether it hangs."""
+"""Largest amount of data that a viewer may be behind, in bytes.
+
+A viewer that is further behind and does not catch up within ``VIEWER_WAIT_S`` counts as hanging.
+"""
 VIEWER_WAIT_S = 2.0
-"""Longest wait for a viewer that is behind, and for Rerun to let go of an output, in s."""
+"""Longest wait for a slow viewer to catch up, and for Rerun to close an output, in s."""
 DELETE_EVERY = 8
-"""Number of closed recordings that are deleted together; Rerun keeps four threads of each."""
-_PROMPT_VIEWER_S = 1e-3  # 0 would not show whether a viewer keeps up
+"""Number of closed recordings that are deleted at once, to end the four threads of each."""
+_PROMPT_VIEWER_S = 1e-3  # a flush with 0 s does not tell if a viewer is up to date
 
 
 class RecordingWarning(SdcWarning):
-    """A recording has ended early; the run goes on without it."""
+    """Warning that a recording has ended early, while the simulation run goes on."""
 
 
 def import_rerun() -> Any:
-    """Import ``rerun``, which sends no statistics unless the user has chosen otherwise.
+    """Import and return ``rerun``, with its usage statistics off unless the user enabled them.
 
     Raises:
         SdcError: rerun-sdk is missing.
     """
     os.environ.setdefault("RERUN_ANALYTICS", "0")
-    # Read once, on import. This module itself warns of lost viewers and full disks.
+    # Rerun reads RUST_LOG once, on import. Its log is turned off because this module itself warns
+    # of lost viewers and full disks.
     silence = "RUST_LOG" not in os.environ
     if silence:
         os.environ["RUST_LOG"] = "off"
@@ -78,14 +82,14 @@ class RecordingOutput:
 
     Args:
         file: file to write, or None.
-        address: viewer to connect to, or None.
-        port: port of 127.0.0.1 to serve viewers on, or None.
+        address: address of the viewer to connect to, or None.
+        port: port of 127.0.0.1 to which viewers can connect, or None.
         name: name of the recording, which viewers show.
-        keep_bytes: bytes that the file leaves free on its disk.
+        keep_bytes: disk space that the recording must leave free, in bytes.
 
     Raises:
-        SdcError: the file cannot be written, another process is writing it, or there is too little
-            room for it.
+        SdcError: the file cannot be written, another process is writing it, or its disk has too
+            little space.
     """
 
     def __init__(
@@ -100,36 +104,36 @@ class RecordingOutput:
         self._file, self._address, self._port, self._name = file, address, port, name
         self._keep_bytes = keep_bytes
         self._stream: rr.RecordingStream | None = None
-        # Chunks of a block are sent together, because each sending wakes Rerun's threads.
+        # Chunks of a block are collected and sent at once, because each call wakes Rerun's threads.
         self._chunks: list[Chunk] = []
         self._whole_bytes = 0
         self._unconfirmed_bytes = 0
         self.failed = False
-        """Whether the output has ended early."""
+        """True if the output has ended early."""
         self._claim = None if file is None else _claim(file, keep_bytes)
         if address is not None and not listens(address):
             self._fail(f"no viewer listens at {address}")
 
     @property
     def is_live(self) -> bool:
-        """Whether somebody may be watching while the recording is made."""
+        """True if a viewer can show the recording during the run."""
         return self._file is None or self._port is not None
 
     @property
     def is_open(self) -> bool:
-        """Whether files and connections are open."""
+        """True if the file and the connections are open."""
         return self._stream is not None
 
     @property
     def place(self) -> str:
-        """File or address, as warnings name it."""
+        """Path or address of the output, for warnings."""
         return str(self._file or self._address or served_at(self._port or 0))
 
     def open(self, blueprint: rrb.Blueprint) -> None:
-        """Open files and connections, and send the blueprint.
+        """Open the file and the connections, and send the blueprint.
 
         Args:
-            blueprint: views of the recording.
+            blueprint: Rerun's description of the views of the recording.
         """
         rr = import_rerun()
         sinks: list[Any] = []
@@ -140,7 +144,7 @@ class RecordingOutput:
             if self._address is not None:
                 sinks.append(rr.GrpcSink(self._address))
             if self._port is not None:
-                # The default binds every interface of the machine.
+                # Without HOST, Rerun would listen on every network interface of the machine.
                 sinks.append(rr.GrpcServerSink(HOST, self._port))
             self._stream.set_sinks(*sinks)
             self._stream.send_recording_name(self._name)
@@ -151,10 +155,12 @@ class RecordingOutput:
             self._fail(f"cannot be opened ({error})")
 
     def has_room_for(self, size_bytes: int) -> bool:
-        """Whether a block of this size may be sent; confirms that the blocks before have arrived.
+        """Return True if a block can be sent, after checking that earlier blocks have arrived.
+
+        Without space on the disk, or with a viewer that hangs, the output ends with a warning.
 
         Args:
-            size_bytes: size of the block, about.
+            size_bytes: approximate size of the block, in bytes.
         """
         if self.failed:
             return False
@@ -162,7 +168,7 @@ class RecordingOutput:
         if not self.failed and self._file is not None:
             try:
                 free = shutil.disk_usage(self._file.parent).free
-            except OSError as error:  # its folder has gone
+            except OSError as error:  # the folder was deleted during the run
                 self._fail(f"cannot be written ({error})")
                 return False
             if free < self._keep_bytes + size_bytes:
@@ -177,30 +183,30 @@ class RecordingOutput:
         return not self.failed
 
     def add_columns(self, entity: str, times: Sequence[Any], columns: Iterable[Any]) -> None:
-        """Add columns of an entity to the block, which ``send_block`` sends.
+        """Add data of an entity to the current block, which ``send_block`` sends.
 
         Args:
             entity: path of the entity.
-            times: columns of times.
-            columns: columns of components, with a row for each time.
+            times: time columns of Rerun, one per timeline.
+            columns: component columns of Rerun, with one row per time.
         """
         from rerun.chunk import Chunk
 
         self._chunks.append(Chunk.from_columns(entity, times, columns))
 
     def send_static(self, entity: str, component: Any) -> None:
-        """Send a static component."""
+        """Send a component of an entity that is the same at all times."""
         if self._stream is not None:
             self._stream.log(entity, component, static=True, strict=True)
 
     def send_block(self) -> None:
-        """Send the block, which Rerun's threads write while the run goes on."""
+        """Send the current block; threads of Rerun write it while the simulation continues."""
         chunks, self._chunks = self._chunks, []
         if self._stream is not None:
             self._stream.send_chunks(chunks)
 
     def close(self) -> None:
-        """Write the remaining blocks and the index, and let other processes write the file."""
+        """Write the remaining blocks and the index, and release the claim on the file."""
         try:
             self._finish()
         finally:
@@ -221,10 +227,10 @@ class RecordingOutput:
         _delete_closed_recordings()
 
     def _confirm_sent(self, viewer_s: float = _PROMPT_VIEWER_S) -> None:
-        """Find out whether all that was sent has arrived; a file has ``FILE_BLOCK_S`` for it.
+        """Check whether all sent blocks have arrived, and end the output if it has failed.
 
         Args:
-            viewer_s: time that a viewer has, in s.
+            viewer_s: longest wait for a viewer, in s; for a file it is ``FILE_BLOCK_S``.
         """
         if self._stream is None or not self._unconfirmed_bytes:
             return
@@ -234,7 +240,8 @@ class RecordingOutput:
             elif self._address is not None and not listens(self._address):
                 self._fail("the viewer has closed")
             return
-        # Not while Python computes: a flush frees texts that were sent, with Python's lock.
+        # The flush runs in a thread of its own because it may never return. While it runs, this
+        # thread only waits: to free Python strings that were sent, the flush takes Python's lock.
         flush = _BackgroundCall(lambda s: s.flush(timeout_sec=FILE_BLOCK_S), self._stream)
         try:
             if not flush.ends_within(FILE_BLOCK_S):
@@ -248,7 +255,7 @@ class RecordingOutput:
             self._fail("the disk is full" if full else f"cannot be written ({error})")
 
     def _arrives_within(self, seconds: float) -> bool:
-        """Whether what was sent to a viewer arrives in time."""
+        """Return True if all sent blocks arrive at the viewer within a time in s."""
         assert self._stream is not None
         try:
             self._stream.flush(timeout_sec=seconds)
@@ -257,11 +264,11 @@ class RecordingOutput:
         return True
 
     def _fail(self, reason: str) -> None:
-        """End the output early, with a warning."""
+        """End the output early, with a warning that gives the reason."""
         self.failed = True
         stream, self._stream = self._stream, None
         if stream is not None:
-            # Rerun waits for a viewer that hangs, and for a file that it cannot write, for ever.
+            # Disconnecting may never return, if a viewer hangs or a file cannot be written.
             if not _BackgroundCall(stream.disconnect).ends_within(VIEWER_WAIT_S):
                 import rerun as rr
 
@@ -271,7 +278,7 @@ class RecordingOutput:
         self._warn(reason)
 
     def _truncate_to_whole_blocks(self) -> None:
-        """Cut off a block that was not written whole, which readers would refuse."""
+        """Cut an incomplete block off the end of the file, because readers reject such a file."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 if self._whole_bytes == 0:
@@ -289,39 +296,42 @@ class RecordingOutput:
 
 
 class _ClosableBlueprint:
-    """A blueprint that closes the stream that Rerun sends it by, which Rerun leaves open."""
+    """Blueprint with a method to close the stream that Rerun opens to send it.
+
+    Rerun itself leaves this stream open.
+    """
 
     def __init__(self, blueprint: rrb.Blueprint) -> None:
         self._blueprint = blueprint
         self._stream: rr.RecordingStream | None = None
 
     def to_blueprint(self) -> Any:
-        """Blueprint that Rerun sends."""
+        """Return the blueprint; Rerun calls this method before it sends a blueprint."""
         return self
 
     def _log_to_stream(self, stream: rr.RecordingStream) -> None:
-        """Send the blueprint, as ``rrb.Blueprint`` does when Rerun calls it."""
+        """Send the blueprint to a stream of Rerun, and remember the stream for ``close``."""
         self._stream = stream
         self._blueprint._log_to_stream(stream)
 
     def close(self) -> None:
-        """Close the stream after sending."""
+        """Close the stream on which Rerun sent the blueprint."""
         if self._stream is not None:
             self._stream.disconnect()
             self._stream = None
 
 
 _HANGING_STREAMS: list[rr.RecordingStream] = []
-"""Kept for ever, because Rerun waits for them when they are deleted."""
+"""Streams that hang; this list keeps them alive, because deleting such a stream never returns."""
 
 _closed = itertools.count(1)
 
 
 def _delete_closed_recordings() -> None:
-    """Delete closed recordings from memory, unless this process has open ones.
+    """Free the memory and threads of closed recordings, unless this process has open ones.
 
-    With open ones, Rerun would first write them out, wait for ever for one that hangs, and then log
-    only to the global one.
+    With open recordings, ``rr.init`` would first flush these, which never returns if one hangs,
+    and Rerun would afterwards log to the global recording only.
     """
     import rerun as rr
 
@@ -333,9 +343,9 @@ def _delete_closed_recordings() -> None:
 
 
 class _BackgroundCall(threading.Thread):
-    """Call in a separate thread, because it may never return.
+    """Function call in a separate thread, for functions that may never return.
 
-    Once writing has failed, a flush of Rerun may not return, whatever its timeout.
+    After a write error, a flush of Rerun may never return, regardless of its timeout.
 
     Args:
         call: the function.
@@ -345,28 +355,33 @@ class _BackgroundCall(threading.Thread):
     def __init__(self, call: Callable[..., object], *arguments: object) -> None:
         super().__init__(target=call, args=arguments, daemon=True)
         self.error: RuntimeError | None = None
-        """Error in which the call ended."""
+        """Exception that the call raised, or None."""
         try:
             self.start()
-        except RuntimeError as error:  # as many threads as the system grants
+        except RuntimeError as error:  # the system allows no further threads
             self.error = error
 
     def run(self) -> None:
-        """Call the function and keep its error."""
+        """Call the function and store the exception that it raises."""
         try:
             super().run()
         except RuntimeError as error:
             self.error = error
 
     def ends_within(self, seconds: float) -> bool:
-        """Whether the call ends in time."""
+        """Return True if the call ends within a time in s."""
         if self.error is None:
             self.join(seconds)
         return not self.is_alive()
 
 
 def _claim(file: Path, keep_bytes: int) -> FileClaim:
-    """Claim a file that can be written and has room; no other process then records to it."""
+    """Claim a file, so that no other process records to it, and check its disk space.
+
+    Args:
+        file: path of the file.
+        keep_bytes: disk space that must remain free, in bytes.
+    """
     claim = FileClaim(file)
     try:
         _check_room(file, keep_bytes)
@@ -377,7 +392,12 @@ def _claim(file: Path, keep_bytes: int) -> FileClaim:
 
 
 def _check_room(file: Path, keep_bytes: int) -> None:
-    """Make sure that the file can be opened and begun; Rerun waits for ever on a full disk."""
+    """Check that a file can be written and its disk has space; on a full disk Rerun would hang.
+
+    Args:
+        file: path of the file.
+        keep_bytes: disk space that must remain free, in bytes.
+    """
     with naming_errors(file):
         new = not file.exists()
         with file.open("ab"):
@@ -393,7 +413,7 @@ def _check_room(file: Path, keep_bytes: int) -> None:
 
 
 def is_address(target: object) -> TypeGuard[str]:
-    """Whether a target is the address of a viewer rather than a file."""
+    """Return True if a target is the address of a viewer, and False if it is a file."""
     return isinstance(target, str) and "://" in target
 
 
@@ -401,7 +421,7 @@ def check_address(address: str) -> str:
     """Check and return the address of a viewer.
 
     Raises:
-        SdcError: the address is not that of a viewer.
+        SdcError: the address does not have the form of a viewer's address.
     """
     valid = f"valid is such as {served_at(DEFAULT_PORT)}"
     try:
@@ -433,15 +453,16 @@ def check_path(path: str | os.PathLike[str]) -> Path:
 
 
 def check_port(port: int) -> int:
-    """Check and return a free port of this machine; 0 picks one.
+    """Check that a port of this machine is free, and return it; 0 picks a free port.
 
     Raises:
-        SdcError: the number is not that of a port, or the port is taken.
+        SdcError: the number is not a valid port, or the port is in use.
     """
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 65536:
         raise SdcError(f"port {port!r}: valid is 0 to 65535, 0 being any free one")
     with socket.socket() as probe:
-        # Servers set this too; a port whose last connections are just closing counts as free.
+        # With this option, which servers set too, a port whose last connections are closing counts
+        # as free.
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -455,12 +476,12 @@ def check_port(port: int) -> int:
 
 
 def served_at(port: int) -> str:
-    """Address at which viewers find a recording that is served on a port of this machine."""
+    """Return the address at which viewers find a recording served on a port of this machine."""
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
 def listens(address: str) -> bool:
-    """Whether something listens at the address of a viewer."""
+    """Return True if a program accepts connections at the address of a viewer."""
     parts = urlsplit(address)
     assert parts.hostname is not None
     assert parts.port is not None

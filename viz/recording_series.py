@@ -33,7 +33,7 @@ class Cadence:
     levels: tuple[int, ...]
     """Number of levels per rack of the 3D hall, for each data center in focus."""
     has_servers: bool
-    """True if each level shows the hottest of its servers.
+    """True if each level shows the hottest inlet and the hottest outlet of its servers.
 
     Otherwise a rack has one level, which shows its hottest inlet and its mean outlet.
     """

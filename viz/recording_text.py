@@ -1,6 +1,7 @@
-"""Texts of a recording: its summary, and the log of failures and limits.
+"""Texts of a recording: its summary, and the log of failures and exceeded limits.
 
-A condition that lasts has one entry of the log when it begins and one when it ends.
+A lasting condition, such as an inlet above its limit, has two entries in the log: one when it
+begins and one when it ends.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from .recording_series import Cadence
 
 MAX_RACKS_PER_STEP = 8
-"""Largest number of racks named when those of a data center change status in one step."""
+"""Largest number of log entries about single racks per step and data center."""
 _LEVELS = {NORMAL: "INFO", THROTTLED: "WARN", TRIPPED: "ERROR"}
 _STATUS_NAMES = {NORMAL: "back to normal", THROTTLED: "throttled", TRIPPED: "tripped"}
 
@@ -36,11 +37,11 @@ _INPUTS_TEXTS = {
     False: "No input is synthetic.",
     None: "",
 }
-"""Sentences about the inputs, by whether some are synthetic; None is not known."""
+"""Sentence about the inputs of a run, keyed by whether some are synthetic; None is unknown."""
 
 
 class LogEntry(NamedTuple):
-    """One line of the log."""
+    """One entry of the event log."""
 
     step: int
     """Step, counted from 0 at reset."""
@@ -53,23 +54,26 @@ class LogEntry(NamedTuple):
 
 
 class _Condition(NamedTuple):
-    """State of a data center that lasts while a quantity exceeds a limit."""
+    """Condition of a data center that holds while a quantity exceeds a limit.
+
+    The log has an entry when the condition begins and an entry when it ends.
+    """
 
     field: str
-    """Name of the quantity."""
+    """Name of the quantity, a field of ``StepResult``."""
     limit: float
-    """Value that the quantity exceeds, in its unit."""
+    """Limit above which the condition holds, in the unit of the quantity."""
     level: str
-    """Level of the first entry."""
+    """Log level of the entry at the begin: ``WARN`` or ``ERROR``."""
     begin: str
-    """Begin of the first entry, which the value follows."""
+    """Text of the entry at the begin, to which the value of the quantity is appended."""
     end: str
-    """Begin of the last entry, which the highest value or the sum follows."""
+    """Text of the entry at the end, to which the maximum or the sum is appended."""
     is_summed: bool = False
-    """Whether the last entry has the sum since the first one."""
+    """True if the entry at the end reports the sum of the quantity, False for its maximum."""
 
     def value_text(self, value: float) -> str:
-        """A value of the quantity with its unit."""
+        """Return a value of the quantity as text with its unit; powers are in kW."""
         unit = QUANTITIES[self.field].unit
         if unit == "C":
             return f"{value:.1f} C"
@@ -99,23 +103,26 @@ CONDITIONS = (
     ),
     _Condition("unserved_kwh", 1e-9, "ERROR", "energy unserved", "no energy unserved now", True),
 )
-"""Conditions of every data center, beside those of its inlets."""
+"""Conditions that are logged for every data center, except those of its inlets.
+
+Limits of inlets depend on the data center, see ``ConditionLog``.
+"""
 
 
 @dataclass(slots=True)
 class _Ongoing:
-    """A condition that lasts."""
+    """State of a condition that has begun and not ended."""
 
     first_step: int
     """Step in which the condition began, counted from 0 at reset."""
     most: float
-    """Highest value since, in the unit of the quantity."""
+    """Maximum of the quantity since the condition began, in the unit of the quantity."""
     total: float
-    """Sum of the values since, in the unit of the quantity."""
+    """Sum of the quantity over the steps since the condition began, in its unit."""
 
 
 class ConditionLog:
-    """Finds where conditions of a data center begin and end, block by block.
+    """Finds the steps at which conditions of a data center begin and end, block by block.
 
     Args:
         fleet: the fleet.
@@ -146,11 +153,11 @@ class ConditionLog:
         self._ongoing: dict[int, _Ongoing] = {}
 
     def entries(self, steps: I64, values: F64) -> Iterator[LogEntry]:
-        """Entries of a block, condition by condition.
+        """Yield the log entries of a block, condition by condition.
 
         Args:
             steps: steps of the block, (T,).
-            values: values of ``FIELDS``, (T, F).
+            values: values of ``FIELDS`` and PUE of the data center, (T, F).
         """
         watched = values[:, self._rows]
         over = watched > self._limits
@@ -160,14 +167,14 @@ class ConditionLog:
     def _follow(
         self, index: int, steps: I64, value: F64, over: npt.NDArray[np.bool_], values: F64
     ) -> Iterator[LogEntry]:
-        """Entries of one condition in a block.
+        """Yield the log entries of one condition in a block.
 
         Args:
             index: index of the condition.
             steps: steps of the block, (T,).
-            value: values of the condition's field, (T,).
-            over: whether these exceed the limit, (T,).
-            values: values of ``FIELDS``, (T, F).
+            value: values of the condition's quantity, (T,).
+            over: True in each step in which the quantity exceeds its limit, (T,).
+            values: values of ``FIELDS`` and PUE of the data center, (T, F).
         """
         condition = self._conditions[index]
         for t, step in enumerate(steps.tolist()):
@@ -197,7 +204,7 @@ class ConditionLog:
 
 
 def rack_place(rack: int, racks_per_row: int) -> str:
-    """Words for the place of a rack in its hall, counted from 0."""
+    """Return row and rack as text, such as ``row 2, rack 17``; both count from 0 in the hall."""
     return f"row {rack // racks_per_row}, rack {rack}"
 
 
@@ -209,18 +216,18 @@ def protection_entries(
     after: Status,
     inlet_c: Reals,
 ) -> Iterator[LogEntry]:
-    """Racks of a data center that throttled, tripped or came back in a step.
+    """Yield log entries for racks that throttled, tripped or recovered in a step.
 
     Args:
         step: the step, counted from 0 at reset.
-        dc: index of the data center.
-        racks_per_row: number of racks in a row of its hall.
-        before: status of its racks before the step, (R,).
-        after: status of its racks after the step, (R,).
-        inlet_c: hottest inlet of a server of each of its racks, in C, (R,).
+        dc: index of the data center, which has R racks.
+        racks_per_row: number of racks in a row of the hall.
+        before: status of the racks before the step, (R,).
+        after: status of the racks after the step, (R,).
+        inlet_c: hottest server inlet of each rack, in C, (R,).
     """
     changed = np.flatnonzero(before != after)
-    # The worst first, so that those not named are the harmless ones.
+    # Racks with the worst status come first, so that the limit omits the least important ones.
     ordered = changed[np.argsort(-after[changed].astype(np.int64), kind="stable")].tolist()
     for rack in ordered[:MAX_RACKS_PER_STEP]:
         status = int(after[rack])
@@ -244,11 +251,11 @@ def failure_entries(
     now: Sequence[ActiveEvent],
     fleet: Fleet,
 ) -> Iterator[LogEntry]:
-    """Failures and weather events that begin or end with a step.
+    """Yield log entries for failures and weather events that begin or have ended at a step.
 
     Args:
         step: the step, counted from 0 at reset.
-        before: events that were active in the step before.
+        before: events that were active in the previous step.
         now: events that are active in the step.
         fleet: the fleet.
     """
@@ -262,7 +269,7 @@ def failure_entries(
 
 
 def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
-    """Words for an event."""
+    """Return the description of an event for the log."""
     if event.kind == "crac_down":
         return "all CRAC units down" if event.target is None else f"CRAC unit {event.target} down"
     if event.kind in DEVICES:
@@ -283,14 +290,14 @@ def summary_markdown(
     scales: Mapping[str, ColourScale],
     cadence: Cadence,
 ) -> str:
-    """Markdown about the run, its inputs, and how to read the recording.
+    """Return a Markdown text about the run and its inputs, and about how to read the recording.
 
     Args:
         description: result of ``describe_run``, or a part of it.
         fleet: the fleet.
-        focus: from the index of each data center in focus to its name in the recording.
-        scales: colour scales of the heat maps, by quantity.
-        cadence: how often heat maps and halls are recorded.
+        focus: name in the recording of each data center in focus, keyed by its index.
+        scales: colour scales of the heat maps, keyed by quantity.
+        cadence: how often and how finely heat maps and 3D halls are recorded.
     """
     ranges = ", ".join(f"{name} {s.low:g} to {s.high:g} {s.unit}" for name, s in scales.items())
     resolution = ", ".join(f"{name} {s.resolution:.4g} {s.unit}" for name, s in scales.items())
@@ -332,24 +339,24 @@ def summary_markdown(
 
 
 def _count_text(number: int, noun: str) -> str:
-    """A number and a noun, in the plural unless the number is 1."""
+    """Return a number and a noun, with a plural "s" unless the number is 1."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _steps_text(steps: int) -> str:
-    """An interval in words."""
+    """Return an interval of steps as text that follows "every"."""
     return "step" if steps == 1 else f"{steps} steps"
 
 
 def _levels_text(cadence: Cadence) -> str:
-    """Words for the temperatures that front and back of a rack of the 3D hall show."""
+    """Return a text about which temperatures front and back of a rack of the 3D hall show."""
     if not cadence.has_servers:
         return "of its servers, its back the mean outlet"
     return f"at each of {_count_text(max(cadence.levels), 'height')}, its back the hottest outlet"
 
 
 def _facts(description: Mapping[str, Any]) -> dict[str, str]:
-    """Facts of the run that are known, by name."""
+    """Return the rows of the table about the run: value of each known fact, keyed by name."""
     names = ("controller", "seed", "precision", "fingerprint")
     facts = {name: str(description[name]) for name in names if name in description}
     if versions := description.get("versions"):
@@ -362,7 +369,14 @@ def _facts(description: Mapping[str, Any]) -> dict[str, str]:
 def _data_center_lines(
     fleet: Fleet, dc: int, name: str, description: Mapping[str, Any]
 ) -> list[str]:
-    """Markdown of a data center: site, hall and inputs."""
+    """Return the lines of Markdown about a data center: site, hall and inputs.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+        name: name of the data center in the recording.
+        description: entry of the data center in the result of ``describe_run``; may be empty.
+    """
     config = fleet.configs[dc]
     first, last = fleet.rack_offsets[dc : dc + 2]
     servers = int(fleet.server_offsets[fleet.group_offsets[last]]) - int(

@@ -1,6 +1,6 @@
-"""Views of a recording, and its static parts: names, colours, formats, colour bars, the hall.
+"""Views of a recording, and its static entities: line styles, image formats, colour bars, halls.
 
-A recording has a tab for each data center in focus, and one for the fleet.
+In the viewer, a recording has a tab for each data center in focus, and one for the fleet.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from .recording_series import (
 PLAYBACK_S_PER_S = 14_400.0
 """Simulated seconds per second of playback."""
 MAX_UNIT_LINES = 24
-"""Largest number of CRAC units with a line each; for more, plots show their range."""
+"""Largest number of CRAC units with one line each; for more, plots show minimum, mean, maximum."""
 
 MAX_ROW_LABELS = 5
-"""Largest number of rows of the 3D hall with a label; more would cover each other."""
-_LABEL_RGB = (135, 135, 135)  # a grey that can be read on a dark and on a light ground
+"""Largest number of labels of rows in the 3D hall; more labels would cover each other."""
+_LABEL_RGB = (135, 135, 135)  # a grey that is legible on dark and on light backgrounds
 
 Entities = Iterator[tuple[str, Any]]
-"""Paths of entities, and the component or archetype that each holds."""
+"""Iterator of entity paths, each with the static component or archetype of the entity."""
 
 
 class FocusTab(NamedTuple):
-    """Tab of a data center in focus."""
+    """Properties of a data center in focus that the views in its tab need."""
 
     name: str
     """Name of the data center in the recording."""
@@ -53,17 +53,17 @@ class FocusTab(NamedTuple):
     size_m: tuple[float, float, float]
     """Length, width and height of the room, in m."""
     scales: Mapping[str, ColourScale]
-    """Colour scales of the heat maps, by quantity."""
+    """Colour scales of the heat maps, keyed by quantity."""
     image_shape: tuple[int, int]
     """Height and width of the heat maps, in pixels."""
 
 
 def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Blueprint:
-    """Arrange the views of a recording.
+    """Return the arrangement of the views of a recording.
 
     Args:
         tabs: tabs of the data centers in focus.
-        has_rewards: whether reward terms are recorded.
+        has_rewards: True if reward terms are recorded.
     """
     focus_tabs = (_focus_tab(tab, has_rewards=has_rewards) for tab in tabs)
     return rrb.Blueprint(
@@ -81,7 +81,7 @@ def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Bluepr
 
 
 def _fleet_tab() -> Any:
-    """Summary, and plots over all data centers."""
+    """Return the tab with the summary and the plots of the whole fleet."""
     plots = [
         _plot_view(f"fleet/{entity}", plot.title, legend=False)
         for entity, plot in FLEET_PLOTS.items()
@@ -95,7 +95,7 @@ def _fleet_tab() -> Any:
 
 
 def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
-    """Heat maps, 3D hall and log at the left, plots at the right."""
+    """Return the tab of a data center: maps, 3D hall and log on the left, plots on the right."""
     maps = rrb.Tabs(
         *(_heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()), active_tab=0
     )
@@ -103,7 +103,7 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
         origin=f"{tab.path}/events",
         name="events",
         columns=rrb.TextLogColumns(
-            # The text has the time, for which the column is too narrow.
+            # The time column is hidden because it is too narrow; the text begins with the time.
             timeline_columns=[rrb.encodings.TimelineColumn("sim_time", visible=False)],
             text_log_columns=["loglevel", "body"],
         ),
@@ -118,7 +118,7 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
 
 
 def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
-    """Plots of a data center in tabs: overview, cooling and work."""
+    """Return the plots of a data center in three tabs: overview, cooling and work."""
 
     def plots(*entities: str) -> list[Any]:
         return [_series_view(tab, entity) for entity in entities]
@@ -152,20 +152,20 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
 
 
 def _series_view(tab: FocusTab, entity: str) -> Any:
-    """Plot of a series of a data center."""
+    """Return the plot of an entity of ``PLOTS``, of the queue or of rewards."""
     origin = f"{tab.path}/series/{entity}"
     if entity == QUEUE_ENTITY:
         return _plot_view(origin, "queue by age [tasks]")
     if entity == REWARDS_ENTITY:
         return _plot_view(origin, "reward terms [-]")
     plot = PLOTS[entity]
-    # The title of a plot with one line is its name.
+    # A plot with one line needs no legend, because its title names the line.
     legend = len(plot.lines) > 1
     return _plot_view(origin, f"{plot.title} [{plot.unit}]", limits=plot.limits, legend=legend)
 
 
 def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
-    """Heat map of the racks over its colour bar."""
+    """Return the view of a heat map of racks, with its colour bar below."""
     bar = rrb.Spatial2DView(
         origin=f"legend/{quantity}",
         name=f"{quantity} scale, {scale.low:g} to {scale.high:g} {scale.unit}",
@@ -184,7 +184,7 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
 
 
 def _hall_view(tab: FocusTab) -> Any:
-    """The hall in 3D, seen from the side of row 0."""
+    """Return the view of the hall in 3D, seen from the side of row 0."""
     length, width, _ = tab.size_m
     far = max(length, width)
     eye = rrb.EyeControls3D(
@@ -208,35 +208,36 @@ def _plot_view(
     limits: tuple[float, float] | None = None,
     legend: bool = True,
 ) -> Any:
-    """Plot of an entity over time.
+    """Return the plot of an entity over time.
 
     Args:
         origin: path of the entity.
         name: title of the plot.
-        limits: ends of the vertical axis; None follows the values.
-        legend: whether the names of the lines are shown.
+        limits: ends of the vertical axis; None scales the axis to the values.
+        legend: True to show the names of the lines.
     """
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
         axis_x=_whole_run(),
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
-        # A legend covers what is behind it; the night that a run begins with is the least loss.
+        # The legend covers a part of the curves. At the left it covers the first hours of the run,
+        # which are at night and least interesting.
         plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
     )
 
 
 def _whole_run() -> Any:
-    """Time axis over the whole run; without it plots open on one minute around the cursor."""
+    """Return a time axis that spans the whole run; Rerun's default is one minute at the cursor."""
     ends = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
     return rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
 
 
 def fleet_entities(scales: dict[str, ColourScale]) -> Entities:
-    """Colour bars, and the lines of the fleet.
+    """Yield the static entities of the fleet: colour bars and line styles.
 
     Args:
-        scales: colour scales of the heat maps, by quantity.
+        scales: colour scales of the heat maps, keyed by quantity.
     """
     for quantity, scale in scales.items():
         yield from _colour_bar(quantity, scale).items()
@@ -252,14 +253,14 @@ def data_center_entities(
     levels: int,
     rewards: Sequence[str],
 ) -> Entities:
-    """Lines, states, images and voxels of a data center.
+    """Yield the static entities of a data center: line styles, states, image formats, 3D hall.
 
     Args:
         fleet: the fleet.
         dc: index of the data center.
         path: path of the data center in the recording.
-        scales: colour scales of the heat maps, by quantity.
-        levels: levels per rack of its 3D hall.
+        scales: colour scales of the heat maps, keyed by quantity.
+        levels: number of levels per rack of the 3D hall.
         rewards: names of the reward terms.
     """
     for entity, plot in PLOTS.items():
@@ -303,7 +304,16 @@ def _hall_entities(
     levels: int,
     units: int,
 ) -> Entities:
-    """Voxels, walls, row labels and CRAC units of a hall in 3D."""
+    """Yield the static entities of a 3D hall: voxels, walls, row labels and CRAC units.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+        path: path of the hall in the recording.
+        scales: colour scales of the heat maps, keyed by quantity.
+        levels: number of levels per rack.
+        units: number of CRAC units.
+    """
     hall = fleet.configs[dc].hall
     grid = rasters.rack_voxels(hall, levels)
     for quantity, cells in (("inlet", grid.front), ("outlet", grid.back)):
@@ -329,7 +339,7 @@ def _hall_entities(
         show_labels=True,
     )
     yield f"{path}/rows", rows
-    # CRAC units stand outside the end walls.
+    # CRAC units are drawn outside the end walls.
     unit_centres_m = [
         (x + (0.5 if x > plan.length_m / 2 else -0.5), y, height_m / 2)
         for x, y in unit_places_m(plan, units)
@@ -346,7 +356,10 @@ def _hall_entities(
 
 
 def _unit_lines(units: int, quantity: str) -> tuple[list[str], list[int]]:
-    """Names and colours of the lines of CRAC units, or of their range if there are many."""
+    """Return names and colours of the lines of a quantity of CRAC units.
+
+    There is one line per unit, or lines for minimum, mean and maximum over many units.
+    """
     if units > MAX_UNIT_LINES:
         return [f"{which} {quantity}" for which in ("lowest", "mean", "highest")], list(PALETTE[:3])
     others = [colour for colour in PALETTE if colour != RED]
@@ -355,13 +368,16 @@ def _unit_lines(units: int, quantity: str) -> tuple[list[str], list[int]]:
 
 
 def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
-    """Names and colours of the lines of a plot."""
-    # An array, because a list of three or four numbers is read as one colour.
+    """Return Rerun's description of the names and colours of the lines of a plot."""
+    # Colours are an array, because Rerun reads a list of three or four numbers as one colour.
     return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
 def _colour_bar(quantity: str, scale: ColourScale) -> dict[str, Any]:
-    """A gradient with labelled points, because the viewer has no colour bar."""
+    """Return the entities of a colour bar: a gradient, and points labelled with values.
+
+    The viewer has no colour bars of its own.
+    """
     gradient, marks = rasters.colour_bar(scale)
     height, width = gradient.shape
     bar = rr.DepthImage(

@@ -1,18 +1,18 @@
-"""Turn the blocks of one recording into entities of the Rerun viewer.
+"""Writer that turns the blocks of one recording into entities of the Rerun viewer.
 
-Entities of a recording, NAME being a data center in focus:
+A recording has these entities, where NAME is the name of a data center in focus:
 
-    dc/NAME/map/{inlet,outlet,power}   a pixel tile per rack
-    dc/NAME/hall/{inlet,outlet}        a voxel per rack and level, in 3D
-    dc/NAME/series/..., crac/...       lines, an entity per unit
+    dc/NAME/map/{inlet,outlet,power}   heat maps, a tile per rack
+    dc/NAME/hall/{inlet,outlet}        3D hall, a voxel per rack and level
+    dc/NAME/series/..., crac/...       series, each entity with lines of one unit
     dc/NAME/actions/...                commands, as states
-    dc/NAME/events                     log
-    fleet/...                          sums and extremes over all data centers
-    legend/..., summary                static
+    dc/NAME/events                     log of events
+    fleet/...                          sums and maxima over all data centers
+    legend/..., summary                static colour bars and text
 
-Timelines are ``step``, from 0 at reset, and ``sim_time``, the start of the step on the data
-center's own clock (see ``year_clock.step_times``); the fleet has the clock of the first one in
-focus.
+Its timelines are ``step``, counted from 0 at reset, and ``sim_time``, the start of the step on the
+clock of the data center (see ``year_clock.step_times``). Entities of the fleet use the clock of
+the first data center in focus.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
 
 LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
-"""Longest time between two blocks of a live recording, and of a file, in s."""
+"""Longest time between two blocks, in s of real time: of a live recording, and of a file."""
 _NO_COMMAND = 2
-"""Stands for the sign of a command before the first step."""
+"""Placeholder for the sign of a command before the first step; differs from -1, 0 and 1."""
 
 
 class RecordingWriter:
@@ -64,12 +64,12 @@ class RecordingWriter:
 
     Args:
         sim: the simulator, before its first step.
-        names: names of its data centers in the recording.
+        names: names of the data centers of the simulator in the recording.
         focus: indices of the data centers in focus.
         description: result of ``describe_run``, or a part of it.
         output: destination of the recording.
-        every_steps: steps between two heat maps and between two frames of the 3D hall; None
-            follows the number of racks in focus.
+        every_steps: interval of heat maps and of frames of the 3D hall, in steps; None derives it
+            from the number of racks in focus.
     """
 
     def __init__(
@@ -100,25 +100,25 @@ class RecordingWriter:
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
-        """Number of steps added."""
+        """Number of steps added to the recording."""
         self._block_s = LIVE_BLOCK_S if output.is_live else FILE_BLOCK_S
-        # The first step of a live recording is shown at once.
+        # A viewer shows the first step at once: its block counts as late from the beginning.
         self._written_at_s = time.monotonic() - (self._block_s if output.is_live else 0.0)
 
     @property
     def failed(self) -> bool:
-        """Whether the recording has ended early."""
+        """True if the recording has ended early."""
         return self._output.failed
 
     def add(self, result: StepResult, rewards: Mapping[str, F64] | None) -> None:
-        """Add a step, and write the block if it is complete.
+        """Add a step, and write the current block if it is full or late.
 
         Args:
             result: result of the step.
-            rewards: reward terms by name, (B,) each.
+            rewards: reward terms by name, (B,) each; None if there are none.
 
         Raises:
-            SdcError: the step does not follow the one before, or the rewards are not valid.
+            SdcError: the step does not follow the previous one, or the rewards are not valid.
         """
         if self.failed:
             return
@@ -129,17 +129,17 @@ class RecordingWriter:
             self._write_block()
 
     def flush(self) -> None:
-        """Write the steps that wait for their block to be complete."""
+        """Write the steps of the current, incomplete block."""
         if self._builder.steps and not self.failed:
             self._write_block()
 
     def close(self) -> None:
-        """Write the remaining steps and the index."""
+        """Write the remaining steps, and the index of the file."""
         self.flush()
         self._output.close()
 
     def _write_block(self) -> None:
-        """Write the block under way."""
+        """Write the current block, and begin a new one."""
         self._written_at_s = time.monotonic()
         block = self._builder.take()
         for index, log in enumerate(self._condition_logs):
@@ -183,7 +183,7 @@ class RecordingWriter:
                 self._output.send_static(entity, component)
 
     def _write_fleet(self, block: Block, times: list[rr.TimeColumn]) -> None:
-        """Series over all data centers."""
+        """Write the series of the whole fleet."""
         for entity, plot in FLEET_PLOTS.items():
             values = plot.factor * np.sum([block.fleet[field] for field in plot.fields], axis=0)
             self._write_scalars(f"fleet/{entity}", times, values[:, None])
@@ -191,7 +191,15 @@ class RecordingWriter:
     def _write_lines(
         self, block: Block, index: int, path: str, times: list[rr.TimeColumn], values: F64
     ) -> None:
-        """Series of a data center: plots, queue, rewards and CRAC units."""
+        """Write the series of a data center: plots, queue, rewards and CRAC units.
+
+        Args:
+            block: the block.
+            index: index of the data center among those in focus.
+            path: path of the data center's entities.
+            times: time columns of the T steps.
+            values: values of ``FIELDS`` and PUE, (T, F).
+        """
         for entity, (rows, factors) in self._rows_and_factors.items():
             self._write_scalars(f"{path}/series/{entity}", times, values[:, rows] * factors)
         queue = block.queue_by_age[:, index]
@@ -208,11 +216,24 @@ class RecordingWriter:
         self._write_scalars(f"{path}/crac/airflow_m3s", times, flow_m3s)
 
     def _write_scalars(self, entity: str, times: list[rr.TimeColumn], values: F64) -> None:
-        """Lines of an entity, (T, lines)."""
+        """Write the lines of an entity.
+
+        Args:
+            entity: path of the entity.
+            times: time columns of the T steps.
+            values: values of the lines, (T, lines).
+        """
         self._output.add_columns(entity, times, rr.Scalars.columns(scalars=values))
 
     def _write_states(self, index: int, path: str, steps: I64, values: F64) -> None:
-        """Commands of a data center, in the steps in which their sign changes."""
+        """Write the commands of a data center as states, at the steps where their sign changes.
+
+        Args:
+            index: index of the data center among those in focus.
+            path: path of the data center's entities.
+            steps: steps of the block, (T,).
+            values: values of ``FIELDS`` and PUE, (T, F).
+        """
         for entity, (command, names) in COMMAND_STATES.items():
             signs = np.sign(values[:, FIELD_ROWS[command]]).astype(np.int64)
             before = np.append(self._last_signs.get((index, entity), _NO_COMMAND), signs[:-1])
@@ -225,12 +246,13 @@ class RecordingWriter:
                 self._output.add_columns(f"{path}/actions/{entity}", times, columns)
 
     def _write_log(self, index: int, path: str, entries: list[LogEntry]) -> None:
-        """Entries of the log of a data center."""
+        """Write the entries of the event log of a data center."""
         if not entries:
             return
         entries.sort(key=lambda entry: entry.step)
         steps = np.array([entry.step for entry in entries])
-        # Day and time of day are in the text, for which the viewer's column of times is too narrow.
+        # The text includes day and time of day, because the time column of the viewer is too narrow
+        # to show both.
         clock = np.datetime_as_string(self._clock(steps)[:, index], "m").tolist()
         log = rr.TextLog.columns(
             text=[f"{at[5:10]} {at[11:]} {e.text}" for at, e in zip(clock, entries, strict=True)],
@@ -246,7 +268,15 @@ class RecordingWriter:
         map_times: list[rr.TimeColumn],
         hall_times: list[rr.TimeColumn],
     ) -> None:
-        """Heat maps and 3D hall of a data center."""
+        """Write the heat maps and the 3D hall of a data center.
+
+        Args:
+            block: the block.
+            index: index of the data center among those in focus.
+            path: path of the data center's entities.
+            map_times: time columns of the heat maps.
+            hall_times: time columns of the frames of the 3D hall.
+        """
         racks, levels = self._builder.racks[index], self._builder.levels[index]
         for quantity, values in block.maps.items():
             scale = self._scales[quantity]
@@ -261,22 +291,25 @@ class RecordingWriter:
             self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
 
     def _clock(self, steps: I64) -> npt.NDArray[np.datetime64]:
-        """Time at which steps begin on the clocks of the data centers in focus, (T, n)."""
+        """Return the times at which T steps begin on the clocks of the n data centers in focus.
+
+        Their shape is (T, n).
+        """
         return step_times(self._start, steps, self._fleet.steps_per_hour)
 
     def _times(self, steps: I64) -> list[list[rr.TimeColumn]]:
-        """Columns of both timelines for each data center in focus."""
+        """Return the time columns of both timelines, for each data center in focus."""
         step = rr.TimeColumn("step", sequence=steps)
         clocks = self._clock(steps).astype("datetime64[ns]").T
         return [[step, rr.TimeColumn("sim_time", timestamp=clock)] for clock in clocks]
 
     def _path(self, dc: int) -> str:
-        """Path of the entities of a data center."""
+        """Return the path of the entities of a data center, ``dc/NAME``."""
         return f"dc/{rr.escape_entity_path_part(self._names[dc])}"
 
 
 def _low_mean_high(unit_values: F64) -> F64:
-    """Lowest, mean and highest over the CRAC units, (T, U) to (T, 3)."""
+    """Return minimum, mean and maximum over U CRAC units in T steps, (T, U) to (T, 3)."""
     return np.stack(
         [unit_values.min(axis=1), unit_values.mean(axis=1), unit_values.max(axis=1)], axis=1
     )
