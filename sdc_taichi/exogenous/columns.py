@@ -1,7 +1,7 @@
-"""Names and units of the columns of a table, where they differ from those that readers expect.
+"""Names and units of the columns of a user's table, if they differ from those that readers expect.
 
-A column is named ``NAME=COLUMN``, or ``NAME:UNIT=COLUMN`` where its numbers are in another unit.
-The user states the unit. It is never inferred from the name of a column or from its numbers.
+The syntax for a column is ``NAME=COLUMN``, or ``NAME:UNIT=COLUMN`` for numbers in another unit. The
+user states the unit. It is never inferred from the name of a column or from its numbers.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ Numbers = TypeVar("Numbers", float, np.ndarray)
 
 
 class Unit(NamedTuple):
-    """A unit, as a linear function of the unit that the reader expects."""
+    """A unit of measurement, with its linear conversion to the unit that the reader expects."""
 
     symbol: str
-    """Symbol, for messages; empty for the unit of the reader."""
+    """Symbol for messages; empty for the unit that the reader expects."""
     size: float = 1.0
-    """One of this unit in the unit of the reader."""
+    """Size of this unit, in units that the reader expects."""
     zero: float = 0.0
-    """The number in this unit that is 0 in the unit of the reader."""
+    """Number in this unit that corresponds to 0 in the unit that the reader expects."""
 
     def convert(self, values: Numbers) -> Numbers:
-        """Numbers in the unit of the reader."""
+        """Convert numbers from this unit to the unit that the reader expects."""
         return (values - self.zero) * self.size
 
     def invert(self, values: Numbers) -> Numbers:
-        """Numbers in this unit."""
+        """Convert numbers from the unit that the reader expects to this unit."""
         return values / self.size + self.zero
 
 
@@ -43,7 +43,7 @@ def _units(**sizes: float) -> dict[str, Unit]:
 
 
 LB_KG = 0.45359237
-"""Kilograms of a pound (NIST Special Publication 811, 2008, appendix B.8)."""
+"""Kilograms per pound (NIST Special Publication 811, 2008, appendix B.8)."""
 _TEMPERATURE = {
     "C": Unit("C"),
     "F": Unit("F", 1.0 / 1.8, 32.0),
@@ -64,27 +64,27 @@ _UNITS: dict[str, dict[str, Unit]] = {
     # Conventional inch and millimetre of mercury, NIST SP 811.
     "pressure": _units(Pa=1.0, hPa=100.0, mbar=100.0, kPa=1e3, inHg=3386.389, mmHg=133.3224),
 }
-"""Units of each column, those of the reader first."""
+"""Valid units of each column; the first is the unit that the reader expects."""
 COLUMN_NAMES = tuple(_UNITS)
-"""Names of columns that the readers know."""
+"""Column names that the readers know."""
 _RANGE = re.compile(r"([kM]?W),(.+)\.\.(.+)")
 _RANGE_EXAMPLE = "kW,120..800 (power when idle and at full load)"
 
 
 class ColumnMap(NamedTuple):
-    """Columns of a table by the names that the readers expect."""
+    """Column names and units of a user's table, by the names that the readers expect."""
 
     names: Mapping[str, str]
-    """Names in the table."""
+    """Column names in the table."""
     units: Mapping[str, Unit]
-    """Units of the columns whose unit the user has stated."""
+    """Units of columns, if the user has stated them."""
 
     def unit(self, name: str) -> Unit:
-        """Unit of a column."""
+        """Return the unit of a column; without a stated unit, the one that the reader expects."""
         return self.units.get(name, Unit(""))
 
     def notes(self) -> list[str]:
-        """Notes that say which column was read as which quantity."""
+        """Return notes that say which column was read as which quantity."""
         return [
             f"{column} read as {name}" + (f", in {unit.symbol}" if unit.symbol else "")
             for name, column in self.names.items()
@@ -93,13 +93,13 @@ class ColumnMap(NamedTuple):
 
 
 def column_map(columns: Mapping[str, str]) -> ColumnMap:
-    """Names and units of columns.
+    """Parse the user's column names and units.
 
     Args:
-        columns: names in the table, by ``NAME`` or ``NAME:UNIT``.
+        columns: column names in the table, by ``NAME`` or ``NAME:UNIT``.
 
     Raises:
-        DataError: a name that is not known or comes twice, or a unit that the column cannot have.
+        DataError: a name is unknown or repeated, or the column cannot have the unit.
     """
     names: dict[str, str] = {}
     units: dict[str, Unit] = {}

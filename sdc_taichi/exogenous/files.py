@@ -1,7 +1,7 @@
-"""Tables of text files: numbers, time stamps, errors that name the row, gaps, and whole years.
+"""Text tables: numbers, time stamps, errors with row numbers, gaps, and cutting to whole years.
 
-Rows are lines of the file counted from 1, headers included, as an editor shows them (rows of a
-Parquet file count from 1 without headers).
+Row numbers are line numbers of the file from 1, headers included, as an editor shows them. (Rows of
+a Parquet file count from 1 without headers.)
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST_ROWS = 20_000_000
-"""Largest number of rows of a Parquet file, which may be compressed: 38 years of minutes."""
+"""Largest number of rows of a Parquet file, 38 years of minutes; compression can hide the size."""
 MAX_GAP_H = 24.0
 """Longest gap that is interpolated, in h."""
 BLANK_HEADERS = frozenset({"", "Unnamed: 0"})
-"""Blank column names; pandas calls a blank first one ``Unnamed: 0``."""
+"""Column names that count as blank; pandas names a blank first column ``Unnamed: 0``."""
 MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
-"""Texts, in lower case, that stand for a missing number."""
+"""Texts, in lower case, that represent a missing number."""
 NO_UNIT = Unit("")
-"""The unit of the reader."""
+"""Placeholder for the unit that the reader expects."""
 _FIRST_BYTES = 4096
 
 
 def fault(path: Path | str, row: int, column: str, value: object, valid: str) -> DataError:
-    """Error that names file, row, column, value and what would be valid."""
+    """Return an error that names file, row, column, value, and valid values."""
     return DataError(f"{path}: row {row}, column {column}: {shortened(value)}, expected {valid}")
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file's bytes, hexadecimal.
+    """Return the SHA-256 hash of a file's bytes, hexadecimal.
 
     Raises:
         DataError: the file cannot be read.
@@ -62,7 +62,7 @@ def sha256(path: Path) -> str:
 
 
 def is_parquet(path: Path) -> bool:
-    """Whether a file is Parquet, by its name or its first bytes.
+    """Return True if a file is Parquet, by its name or its first bytes.
 
     Raises:
         DataError: the file cannot be read.
@@ -72,24 +72,24 @@ def is_parquet(path: Path) -> bool:
 
 
 class Table(NamedTuple):
-    """A table of text, whose rows are labelled with their numbers in the file."""
+    """A table of text with the row numbers of its file."""
 
     path: Path | str
-    """File or address that the table comes from, for messages."""
+    """File or address of the table, for messages."""
     frame: pd.DataFrame
-    """The cells; the index holds the numbers of the rows."""
+    """Cells of the table; its index contains the row numbers."""
 
     def refuse(self, column: str, wrong: Any, valid: str, value: object = None) -> None:
-        """Raise an error that names the first wrong row, if there is one.
+        """Raise an error that names the first invalid row, if there is one.
 
         Args:
             column: name of the column.
-            wrong: which rows are wrong, (T,).
-            valid: what would be valid.
-            value: value for the message; None is the cell.
+            wrong: True for each invalid row, (T,).
+            valid: description of valid values, for the message.
+            value: value for the message; None stands for the text of the cell.
 
         Raises:
-            DataError: a row is wrong.
+            DataError: at least one row is invalid.
         """
         wrong = np.asarray(wrong, dtype=bool)
         if wrong.any():
@@ -98,10 +98,10 @@ class Table(NamedTuple):
             raise fault(self.path, int(self.frame.index[at]), column, value, valid)
 
     def require_columns(self, *columns: str) -> None:
-        """Check that the table has columns.
+        """Check that the table has all of these columns.
 
         Raises:
-            DataError: names the missing and the present ones.
+            DataError: columns are missing; the message lists missing and present ones.
         """
         names = self.frame.columns
         missing = [column for column in columns if column not in names]
@@ -117,20 +117,20 @@ class Table(NamedTuple):
     def numbers(
         self, column: str, low: float, high: float, hint: str = "", unit: Unit = NO_UNIT
     ) -> FloatArray:
-        """A column as numbers; blanks and NaN markers become NaN.
+        """Return a column as numbers; blanks and NaN markers become NaN.
 
         Args:
             column: name of the column.
-            low: least valid value.
-            high: greatest valid value.
-            hint: appended to what would be valid.
+            low: smallest valid value.
+            high: largest valid value.
+            hint: text appended to the valid range in the message.
             unit: unit of the cells.
 
         Returns:
             Numbers in the unit of ``low`` and ``high``, (T,).
 
         Raises:
-            DataError: text that is no number, or a value outside [low, high].
+            DataError: a cell is not a number, or its value is outside [low, high].
         """
         import pandas as pd
 
@@ -146,15 +146,15 @@ class Table(NamedTuple):
     def stamps(
         self, column: str, time_format: str = "ISO8601"
     ) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
-        """Time stamps of a column, and which of them have a UTC offset.
+        """Return the time stamps of a column, and which of them have a UTC offset.
 
         Args:
             column: name of the column.
-            time_format: format of the stamps, as of ``strptime``.
+            time_format: format of the stamps, in the syntax of ``strptime``.
 
         Returns:
-            Times in UTC, or as they are where there is no offset, (T,), NaT where a cell is no
-            time; and whether each has an offset, (T,).
+            Times, (T,), in UTC if they have an offset, else unchanged; NaT for a cell that is not a
+            time. Second, True for each stamp with an offset, (T,).
         """
         import pandas as pd
 
@@ -166,15 +166,15 @@ class Table(NamedTuple):
     def spread(
         self, values: FloatArray, positions: NDArray[np.int64]
     ) -> tuple[FloatArray, NDArray[np.int64], list[str]]:
-        """Values on a regular grid.
+        """Place the values of the rows on a regular grid.
 
         Args:
             values: values of the rows, (T, ...).
-            positions: places of the rows on the grid, increasing from 0, (T,).
+            positions: grid positions of the rows, increasing from 0, (T,).
 
         Returns:
-            Values, NaN where no row is, (N, ...); the row of the file at or after each place, (N,);
-            and notes.
+            Grid values, NaN at positions without a row, (N, ...); the file's row number at or after
+            each position, (N,); and notes.
         """
         grid = np.full((int(positions[-1]) + 1, *values.shape[1:]), np.nan)
         grid[positions] = values
@@ -192,10 +192,10 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
 
     Args:
         path: the file.
-        columns: new names of columns, and their names in the file.
+        columns: column names in the file, by their new names.
 
     Raises:
-        DataError: not readable as a table, without rows, or without one of ``columns``.
+        DataError: the file is no readable table, has no rows, or lacks one of ``columns``.
     """
     import pandas as pd
 
@@ -224,12 +224,12 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
             f"another column of the file has"
         )
     frame = frame.rename(columns={column: name for name, column in columns.items()})
-    # Time stamps first, where the reader of workload looks for them.
+    # Put time stamps first, where the workload reader expects them.
     return Table(path, frame[sorted(frame.columns, key=lambda name: name != "timestamp")])
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
-    """Table of a CSV file, all columns as text."""
+    """Read a CSV file with all columns as text."""
     import pandas as pd
 
     with (
@@ -240,7 +240,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
         if b"\0" in file.read(_FIRST_BYTES):
             raise DataError(f"{path}: holds zero bytes, expected UTF-8 text")
         file.seek(0)
-        # A row of another width than the header is reported by what is missing then.
+        # Rows with a wrong number of cells cause an error later, about the missing values.
         warnings.simplefilter("ignore", pd.errors.ParserWarning)
         try:
             frame = pd.read_csv(
@@ -260,10 +260,10 @@ def _read_csv(path: Path) -> pd.DataFrame:
 
 
 def read_arrow(path: Path) -> pa.Table:
-    """Arrow table of a Parquet file.
+    """Read a Parquet file as an Arrow table.
 
     Raises:
-        DataError: not a readable Parquet file, or one of too many rows.
+        DataError: the file is not a readable Parquet file, or has too many rows.
     """
     import pyarrow.parquet as pq
 
@@ -279,10 +279,10 @@ def read_arrow(path: Path) -> pa.Table:
 
 
 def read_schema(path: Path) -> pa.Schema:
-    """Names, types and metadata of the columns of a Parquet file.
+    """Read names, types and metadata of the columns of a Parquet file.
 
     Raises:
-        DataError: not a readable Parquet file.
+        DataError: the file is not a readable Parquet file.
     """
     import pyarrow.parquet as pq
 
@@ -294,9 +294,9 @@ def read_schema(path: Path) -> pa.Schema:
 
 
 def mapping_hint(columns: Iterable[object]) -> str:
-    """Hint for a message about columns that says how to import a table of Electricity Maps.
+    """Return a hint, for messages, on how to import a table of Electricity Maps.
 
-    Empty for other tables.
+    The hint is empty for other tables.
 
     Args:
         columns: names of the columns of the file.
@@ -328,7 +328,7 @@ def fill_gaps(
         rows: row of the file that each value came from, for messages, (T,).
 
     Raises:
-        DataError: a gap longer than 24 h, or no value at all.
+        DataError: a gap is longer than 24 h, or there is no value at all.
     """
     filled, index = values.copy(), np.arange(len(values))
     for column, of_column in zip(columns, filled.T, strict=True):
@@ -347,7 +347,7 @@ def fill_gaps(
 
 
 def rows_per_year(path: Path | str, minutes: float) -> int:
-    """Number of intervals in 365 days.
+    """Return the number of intervals in 365 days.
 
     Raises:
         DataError: the resolution is not positive or does not divide a day.
@@ -364,7 +364,7 @@ def check_length(path: Path | str, n: int, minutes: float) -> None:
     """Reject files shorter than a year of 365 days (8,760 hourly rows).
 
     Raises:
-        DataError: names the number of rows and the least number.
+        DataError: there are too few rows; the message names the required number.
     """
     least = rows_per_year(path, minutes)
     if n < least:
@@ -379,20 +379,20 @@ def whole_years(
 ) -> tuple[FloatArray, list[str]]:
     """Cut contiguous values to whole 365-day years and begin them on 1 January at 00:00.
 
-    What lies before the first 1 January is moved to the end. A start within an interval (a UTC
-    offset in half hours) is averaged by overlap, which conserves the mean.
+    Values before the first 1 January move to the end. If the first value starts within an interval
+    (a UTC offset with a half hour), values are averaged by overlap, which conserves the mean.
 
     Args:
         path: file, for messages.
         values: shape (T, ...), without 29 February.
-        since_minutes: start of the first value since 1 January 00:00 of a 365-day year.
-        minutes: resolution.
+        since_minutes: start of the first value, in minutes since 1 January 00:00 of a 365-day year.
+        minutes: resolution, in minutes.
 
     Returns:
         Values, shape (years * rows per year, ...), and notes.
 
     Raises:
-        DataError: fewer than 365 days.
+        DataError: the values cover fewer than 365 days.
     """
     notes = []
     check_length(path, len(values), minutes)
@@ -418,7 +418,7 @@ def whole_years(
 def calendar_years(
     path: Path | str, values: FloatArray, start: np.datetime64, minutes: float
 ) -> tuple[FloatArray, list[str]]:
-    """Cut contiguous values of the calendar to whole 365-day years, as ``whole_years`` does.
+    """Cut contiguous calendar values to whole 365-day years, as ``whole_years`` does.
 
     Args:
         path: file, for messages.
@@ -430,7 +430,7 @@ def calendar_years(
         Values, shape (years * rows per year, ...), and notes.
 
     Raises:
-        DataError: fewer than 365 days.
+        DataError: the values cover fewer than 365 days.
     """
     leap = leap_days(len(values), start, minutes)
     first = start + np.timedelta64(round(float(np.argmin(leap)) * minutes * 60), "s")
@@ -440,7 +440,7 @@ def calendar_years(
 
 
 def leap_days(count: int, start: np.datetime64, minutes: float) -> NDArray[np.bool_]:
-    """Which of a number of contiguous intervals begin on 29 February, (count,).
+    """Return True for each of ``count`` contiguous intervals that begins on 29 February, (count,).
 
     Args:
         count: number of intervals.
@@ -454,15 +454,15 @@ def leap_days(count: int, start: np.datetime64, minutes: float) -> NDArray[np.bo
 def grid_of_stamps(
     table: Table, stamps: NDArray[np.datetime64], column: str
 ) -> tuple[float, NDArray[np.int64]]:
-    """Resolution of increasing stamps and the place of each on the regular grid.
+    """Return the resolution of increasing stamps, and their positions on the regular grid.
 
     Args:
         table: the table.
-        stamps: stamps of its rows, datetime64[s], (T,).
-        column: name of the column of the stamps.
+        stamps: time stamps of the rows, datetime64[s], (T,).
+        column: name of the stamps' column, for messages.
 
     Returns:
-        Resolution in minutes (the most frequent step), and places from 0, (T,).
+        Resolution in minutes (the most frequent step), and grid positions from 0, (T,).
 
     Raises:
         DataError: stamps repeat, decrease, are not on the grid, or leave a gap of more than 24 h.

@@ -1,4 +1,4 @@
-"""Validate, align and store files in the user's data folder."""
+"""Import of user files: validate, align to the clock, and store in the data folder."""
 
 from __future__ import annotations
 
@@ -39,30 +39,33 @@ KINDS = ("weather", "carbon", "workload")
 
 @dataclass(frozen=True)
 class Imported:
-    """A file that was imported."""
+    """Result of the import of one file."""
 
     kind: str
     """Kind of data in the file: ``weather``, ``carbon`` or ``workload``."""
     name: str
-    """Name of the site or trace that it became, or became part of."""
+    """Name of the site or trace to which the data belong."""
     source: Path
-    """The file that was read."""
+    """File that was read."""
     target: Path
-    """The Parquet file that was written."""
+    """Parquet file that was written."""
     notes: tuple[str, ...]
-    """Repairs, with counts, and warnings."""
+    """Repairs with their counts, and warnings."""
 
 
 def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Kind of a file by its content: ``weather``, ``weather table``, ``carbon`` or ``workload``.
+    """Detect the kind of a file from its content.
 
     Args:
         path: the file.
-        columns: names of columns as the readers expect them, and their names in the file, as of
+        columns: column names in the file by the names that the readers expect, in the syntax of
             ``exogenous.columns``.
 
+    Returns:
+        ``weather``, ``weather table``, ``carbon`` or ``workload``.
+
     Raises:
-        DataError: none of them.
+        DataError: the file is of none of these kinds.
     """
     if files.is_parquet(path):
         metadata = series_file.read_metadata(path) or {}
@@ -91,23 +94,23 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
 
 @dataclass(frozen=True)
 class Origin:
-    """Source of a fetched file, which is stored with its data."""
+    """Provenance of a fetched file, which is stored with its data."""
 
     service: str
-    """Name of the service, with its publisher."""
+    """Name and publisher of the service."""
     licence: str
-    """Licence of the data, or what is known of it."""
+    """Licence of the data, as far as it is known."""
     downloads: tuple[Mapping[str, Any], ...]
-    """Address, time in UTC and checksum of each download that the file was made of."""
+    """Address, time in UTC and checksum of each download from which the file was built."""
     notes: tuple[str, ...] = ()
-    """What was done to the downloads to make the file, with counts."""
+    """Conversions between the downloads and the file, with their counts."""
 
 
 def site_name(name: str, data_dir: Path | None = None) -> str:
-    """Name under which a site is or will be imported.
+    """Return the name under which a site is or will be stored.
 
     Raises:
-        DataError: not usable, or that of an embedded site.
+        DataError: the name is not usable, or belongs to an embedded site.
     """
     return _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
 
@@ -125,8 +128,8 @@ def import_weather(
 ) -> Imported:
     """Store a weather file as ``sites/NAME/weather.parquet``, with its origin if it was fetched.
 
-    A table, which does not say where its station is, is read by ``read_weather_table`` with
-    ``place``, ``stamp`` and ``columns``; without a place the file is an EPW file.
+    A table does not contain the location of its station, so ``read_weather_table`` reads it with
+    ``place``, ``stamp`` and ``columns``. Without a place, the file must be an EPW file.
     """
     name = site_name(name, data_dir)
     if place is None:
@@ -154,7 +157,7 @@ def import_weather(
 
 
 def _design_metadata(design: DesignConditions | None) -> dict[str, float] | None:
-    """Design conditions as numbers by name, without what is not known."""
+    """Return the known design conditions as numbers by name."""
     if design is None:
         return None
     return {name: value for name, value in asdict(design).items() if value is not None}
@@ -173,8 +176,7 @@ def import_carbon(
 ) -> Imported:
     """Store a carbon file, with its origin if it was fetched, as ``sites/NAME/carbon.parquet``.
 
-    The UTC offset is that of ``site_clock``; ``stamp`` and ``columns`` are those of
-    ``read_carbon``.
+    ``site_clock`` describes the UTC offset; ``read_carbon`` describes ``stamp`` and ``columns``.
 
     Raises:
         DataError: the UTC offset is not known, or differs from that of the weather.
@@ -194,19 +196,19 @@ def site_clock(
     *,
     utc_offset_h: float | None = None,
 ) -> tuple[float, float | None]:
-    """UTC offset of a site, in h, and its longitude, in degrees east, None if it is not known.
+    """Return the UTC offset of a site in h, and its longitude in degrees east (None if unknown).
 
     The offset is that of the weather imported under the same name. Without weather it is
     ``utc_offset_h``, and without that the offset of the base.
 
     Args:
         name: name of the site.
-        base: embedded site that gives what is missing.
+        base: embedded site that supplies missing data.
         data_dir: folder of imported files instead of the user's.
         utc_offset_h: local standard time minus UTC, in h.
 
     Raises:
-        DataError: none of them is known, or they differ.
+        DataError: no offset is known, or ``utc_offset_h`` differs from the known one.
     """
     offset, longitude = utc_offset_h, None
     weather_path = imported_sites(data_dir).get(name, {}).get("weather")
@@ -235,7 +237,7 @@ def import_workload(
     *,
     columns: Mapping[str, str] = MappingProxyType({}),
 ) -> Imported:
-    """Store a workload file, with ``columns`` of ``read_workload``, as ``traces/NAME.parquet``."""
+    """Store a workload file as ``traces/NAME.parquet``; see ``read_workload`` for ``columns``."""
     name = _stored_name(new_name("trace", name, synthetic_traces()), imported_traces(data_dir))
     target = user_data_dir(data_dir) / "traces" / f"{name}.parquet"
     trace = read_workload(path, columns=columns)
@@ -243,18 +245,19 @@ def import_workload(
 
 
 def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
-    """Plan the import of a SustainDC ``data`` folder, or of one with carbon, weather, workload.
+    """Plan the import of a folder with carbon, weather and workload files, like SustainDC's.
 
-    Every weather file becomes a site, with the carbon file of its state. The station that the
-    embedded year is fitted to, or without it the first of the state, is named like ``NY-real``;
-    other stations have their own name added. Every workload file becomes a trace.
+    Every weather file becomes a site, with the carbon file of the same state. The site name of a
+    state's main station is like ``NY-real``; other stations append their own name. The main station
+    is the one to which the embedded year was fitted, or else the first. Every workload file becomes
+    a trace.
 
     Returns:
-        Kind, path and name of each import, weather before carbon; and the files left out, each
-        with the reason.
+        Kind, path and name of each import, weather before carbon; and the skipped files, each with
+        the reason.
 
     Raises:
-        DataError: the folder has none of the subfolders, or no file in them.
+        DataError: the folder has none of the subfolders, or they contain no files.
     """
     subfolders = {
         "weather": ("weather", ".epw"),
@@ -299,17 +302,17 @@ def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[P
 
 
 def default_name(path: Path) -> str:
-    """Name of a file without suffix, made valid as a name."""
+    """Return the stem of a file name as a valid name, with ``-`` for invalid characters."""
     return _clean(path.stem)
 
 
 def _stored_name(name: str, existing: Iterable[str]) -> str:
-    """The name as it is stored already, if it differs in case alone."""
+    """Return the name with the spelling of an existing name that differs only in case."""
     return next((x for x in existing if x.casefold() == name.casefold()), name)
 
 
 def _clean(text: str) -> str:
-    """The text with what is not valid in a name replaced by ``-``."""
+    """Return the text with ``-`` in place of each character that is not valid in a name."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in text).strip(
         "-"
     )

@@ -1,8 +1,8 @@
-"""Sites and workload traces by name: the embedded ones and those the user imported.
+"""Sites and workload traces by name, both embedded ones and those that the user imported.
 
-Imported files are in ``$SDC_TAICHI_DATA``, or in the platform's folder for user data:
-``sites/NAME/weather.parquet``, ``sites/NAME/carbon.parquet``, ``traces/NAME.parquet``. An imported
-name never hides an embedded one.
+Imported files are in ``$SDC_TAICHI_DATA``, or in the platform's folder for user data. They are
+``sites/NAME/weather.parquet``, ``sites/NAME/carbon.parquet`` and ``traces/NAME.parquet``. An
+imported site or trace cannot have the name of an embedded one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def user_data_dir(data_dir: str | Path | None = None) -> Path:
-    """Folder of imported files: the argument, ``$SDC_TAICHI_DATA``, or the platform's folder."""
+    """Return the folder of imported files: ``data_dir``, ``$SDC_TAICHI_DATA``, or the default."""
     if data_dir is not None:
         return Path(data_dir)
     if os.environ.get("SDC_TAICHI_DATA"):
@@ -47,7 +47,7 @@ def user_data_dir(data_dir: str | Path | None = None) -> Path:
 
 
 def imported_sites(data_dir: str | Path | None = None) -> dict[str, dict[str, Path]]:
-    """Imported sites: name to ``{"weather": path, "carbon": path}``, either may be missing."""
+    """Return the files of each imported site, by ``weather`` and ``carbon``; one may be missing."""
     sites: dict[str, dict[str, Path]] = {}
     folder = user_data_dir(data_dir) / "sites"
     for name in list_folder(folder, DataError):
@@ -59,27 +59,27 @@ def imported_sites(data_dir: str | Path | None = None) -> dict[str, dict[str, Pa
 
 
 def imported_traces(data_dir: str | Path | None = None) -> dict[str, Path]:
-    """Imported workload traces: name to path."""
+    """Return the path of each imported workload trace, by name."""
     folder = user_data_dir(data_dir) / "traces"
     names = [x for x in list_folder(folder, DataError) if x.endswith(".parquet")]
     return {name.removesuffix(".parquet"): folder / name for name in names}
 
 
 def site_names(data_dir: str | Path | None = None) -> tuple[str, ...]:
-    """Embedded sites, then imported ones."""
+    """Return the names of all sites, embedded ones first."""
     return (*synthetic_sites(), *imported_sites(data_dir))
 
 
 def trace_names(data_dir: str | Path | None = None) -> tuple[str, ...]:
-    """Embedded workload traces, then imported ones."""
+    """Return the names of all workload traces, embedded ones first."""
     return (*synthetic_traces(), *imported_traces(data_dir))
 
 
 def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
-    """The valid name that equals ``name`` up to case.
+    """Return the valid name that equals ``name``, ignoring case.
 
     Raises:
-        DataError: none does; names the nearest valid ones.
+        DataError: no valid name is equal; the message lists the most similar ones.
     """
     by_folded = {x.casefold(): x for x in valid}
     valid_name = by_folded.get(name.strip().casefold())
@@ -91,10 +91,10 @@ def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
 
 
 def new_name(kind: str, name: str, embedded: tuple[str, ...]) -> str:
-    """Check a name for an import.
+    """Check the name of a new import, and return it.
 
     Raises:
-        DataError: not usable as a folder name, or that of an embedded site or trace.
+        DataError: the name cannot be a folder name, or belongs to an embedded site or trace.
     """
     if not _NAME.fullmatch(name):
         raise DataError(
@@ -112,16 +112,16 @@ def new_name(kind: str, name: str, embedded: tuple[str, ...]) -> str:
 def load_site(
     name: str, *, seed: int = DEFAULT_SEED, data_dir: str | Path | None = None
 ) -> SiteData:
-    """Weather and carbon intensity of a site.
+    """Load weather and carbon intensity of a site.
 
     Args:
-        name: embedded or imported, any case.
-        seed: of the synthetic year, for embedded sites and for embedded parts of imported ones.
+        name: name of an embedded or imported site; case is ignored.
+        seed: seed of the synthetic year, for embedded sites and embedded parts of imported sites.
         data_dir: folder of imported files instead of the user's.
 
     Raises:
-        DataError: unknown name, an imported site that lacks a part and was not given a base, or
-            an imported file that is damaged.
+        DataError: the name is unknown, an imported site lacks a part and has no base, or an
+            imported file is damaged.
     """
     name = find_name("site", name, site_names(data_dir))
     if name in synthetic_sites():
@@ -143,17 +143,17 @@ def load_site(
 def site_pressure_pa(
     name: str, weather_file: str | Path | None = None, *, data_dir: str | Path | None = None
 ) -> float:
-    """Air pressure of the standard atmosphere at the height of a site, in Pa.
+    """Return the pressure of the standard atmosphere at the elevation of a site, in Pa.
 
-    Reads no more than the header of a file, unlike ``load_site``.
+    Unlike ``load_site``, this function reads only the header of a file.
 
     Args:
-        name: embedded or imported, any case.
-        weather_file: EPW or imported Parquet in place of the weather of ``name``.
+        name: name of an embedded or imported site; case is ignored.
+        weather_file: EPW or imported Parquet file that replaces the weather of ``name``.
         data_dir: folder of imported files instead of the user's.
 
     Raises:
-        DataError: unknown name, or a file that is damaged.
+        DataError: the name is unknown, or a file is damaged.
     """
     if weather_file is not None:
         return float(standard_pressure_pa(read_elevation_m(weather_file)))
@@ -170,15 +170,15 @@ def site_pressure_pa(
 def load_trace(
     name: str, *, seed: int = DEFAULT_SEED, data_dir: str | Path | None = None
 ) -> Series:
-    """A workload trace, share of the capacity.
+    """Load a workload trace, as a share of the capacity.
 
     Args:
-        name: embedded or imported, any case.
-        seed: of the synthetic year, for embedded traces.
+        name: name of an embedded or imported trace; case is ignored.
+        seed: seed of the synthetic year, for embedded traces.
         data_dir: folder of imported files instead of the user's.
 
     Raises:
-        DataError: unknown name, or an imported file that is damaged.
+        DataError: the name is unknown, or an imported file is damaged.
     """
     name = find_name("trace", name, trace_names(data_dir))
     if name in synthetic_traces():
@@ -195,21 +195,21 @@ def site_from_files(
     stamp: Stamp = "auto",
     pairing: Pairing = "local",
 ) -> SiteData:
-    """A site from a weather file, a carbon file, or both, without importing them.
+    """Build a site from a weather file, a carbon file, or both, without importing them.
 
-    The weather file's header gives location and UTC offset. What no file gives is taken from
-    ``base``, and is then synthetic if the base is.
+    The weather file's header gives location and UTC offset. ``base`` supplies the data without a
+    file, which are synthetic if the base is.
 
     Args:
-        base: site that gives what is missing; None if both files are given.
-        weather: EPW or imported Parquet.
-        carbon: CSV or imported Parquet.
-        name: name of the site; None is that of the base, or the stem of the weather file.
-        stamp: what a stamp of the carbon file marks, see ``read_carbon``.
+        base: site that supplies missing data; None if both files are given.
+        weather: EPW or imported Parquet file.
+        carbon: CSV or imported Parquet file.
+        name: name of the site; None stands for that of the base, or the stem of the weather file.
+        stamp: moment that a stamp of the carbon file marks, see ``read_carbon``.
         pairing: see ``read_carbon``.
 
     Raises:
-        DataError: neither file nor base gives a part, or a file is not valid.
+        DataError: a part has neither a file nor a base, or a file is not valid.
     """
     if weather is not None:
         station: Weather = read_epw(weather)
@@ -241,17 +241,17 @@ def site_from_files(
 
 
 def _state(label: str) -> str | None:
-    """State of a weather station of the USA, by the label of its file; else None."""
+    """Return the state of a US weather station, from the label of its file; else None."""
     *_, state, country = ("", "", *label.split(", "))
     return state if country == "USA" else None
 
 
 def _with_region_note(intensity: Series, state: str | None) -> Series:
-    """Carbon intensity with a warning if its file is named after another state, as SustainDC's are.
+    """Add a warning to carbon intensity if its file name has the code of another state.
 
     Args:
-        intensity: read from a file.
-        state: two letters of the state of the weather; None if it is not known.
+        intensity: carbon intensity from a file; SustainDC's files are named after states.
+        state: two-letter code of the state of the weather; None if it is not known.
     """
     named = _STATE_OF_CARBON_FILE.match(intensity.source)
     has_note = any("another region" in note for note in intensity.notes)

@@ -1,7 +1,7 @@
-"""Time series of a site: a year or more of values on the simulator's clock.
+"""Time series of a site: one or more years of values on the simulator's clock.
 
 The clock is local standard time in years of 365 days (``exogenous.year_clock``). Index 0 is the
-interval that begins on 1 January at 00:00; a value stands for its whole interval.
+interval that begins on 1 January at 00:00. A value describes its whole interval.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from sdc_taichi.exogenous.year_clock import (
 FloatArray = NDArray[np.float64]
 
 OUTDOOR_LIMITS_C = (-90.0, 60.0)
-"""Limits of temperatures outdoors, in C: the extremes on record (WMO) are -89.2 C (Vostok 1983) and
-56.7 C (Furnace Creek 1913). Any summer in degrees Fahrenheit lies above them."""
+"""Limits of outdoor temperatures, in C. The extremes on record (WMO) are -89.2 C (Vostok 1983) and
+56.7 C (Furnace Creek 1913). Summer temperatures in degrees Fahrenheit exceed the upper limit."""
 MEAN_LIMITS_C = (-65.0, 40.0)
-"""Limits of the mean temperature of a year, in C: about -58 C on the Antarctic plateau, 34.6 C at
-Dallol (Ethiopia) are the extremes."""
+"""Limits of the annual mean temperature, in C. The extremes are about -58 C on the Antarctic
+plateau and 34.6 C at Dallol (Ethiopia)."""
 MOST_SPREAD_K = 115.0
-"""Largest difference of temperatures in a year, in K: 105 K at Verkhoyansk is the extreme."""
+"""Largest valid range of temperatures in a year, in K; the extreme is 105 K at Verkhoyansk."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Values at regular intervals, periodic beyond the end."""
+    """Values at regular intervals; after the end the series starts again."""
 
     values: FloatArray
     """Value of each interval, in ``unit``, (T,); finite, read-only."""
@@ -45,17 +45,17 @@ class Series:
     unit: str
     """Unit of the values, such as ``C``."""
     source: str
-    """Origin of the values: a file, or what a synthetic year is fitted to."""
+    """Origin of the values: a file, or the data to which a synthetic year is fitted."""
     synthetic: bool
-    """Whether the values were generated rather than measured."""
+    """True if the values were generated, False if they were measured."""
     notes: tuple[str, ...] = field(default=())
-    """Repairs, with counts, and warnings."""
+    """Repairs with their counts, and warnings."""
 
     def __post_init__(self) -> None:
         """Take a read-only copy of the values and check them.
 
         Raises:
-            DataError: values are not a finite vector, or the resolution is not positive.
+            DataError: the values are not a finite vector, or the resolution is not positive.
         """
         values = np.array(self.values, dtype=np.float64)
         if values.ndim != 1 or values.size == 0:
@@ -82,17 +82,17 @@ class DesignConditions:
     """Climatic design conditions of a station (ASHRAE Handbook - Fundamentals 2021, chapter 14)."""
 
     outdoor_c: float
-    """Dry bulb that is exceeded for 0.4 % of the year, in C."""
+    """Dry bulb exceeded during 0.4 % of the year, in C."""
     wet_bulb_c: float
-    """Wet bulb that is exceeded for 0.4 % of the year, for evaporation, in C."""
+    """Wet bulb exceeded during 0.4 % of the year (design value for evaporation), in C."""
     extreme_outdoor_c: float | None = None
     """Highest dry bulb in 20 years, in C; None if it is not known."""
 
     def __post_init__(self) -> None:
-        """Check that the values are those of a place on Earth.
+        """Check that the values are possible on Earth.
 
         Raises:
-            DataError: a value out of range, or a wet bulb above the dry bulb.
+            DataError: a value is out of range, or the wet bulb is above the dry bulb.
         """
         check_physical("design dry bulb", self.outdoor_c, *OUTDOOR_LIMITS_C)
         check_physical("design wet bulb", self.wet_bulb_c, -90.0, self.outdoor_c)
@@ -100,10 +100,10 @@ class DesignConditions:
 
 @dataclass(frozen=True, eq=False)
 class Weather:
-    """Weather of a station on the simulator's clock, and where the station is."""
+    """Weather of a station on the simulator's clock, and the location of the station."""
 
     label: str
-    """Place, such as ``Phoenix, Arizona``."""
+    """Name of the place, such as ``Phoenix, Arizona``."""
     latitude_deg: float
     """Latitude, in degrees north."""
     longitude_deg: float
@@ -124,10 +124,10 @@ class Weather:
     """Design conditions of the station; None if its file has none."""
 
     def __post_init__(self) -> None:
-        """Check that the year is one of a place on Earth.
+        """Check that the temperatures are possible on Earth.
 
         Raises:
-            DataError: a mean or a spread of temperatures that no place has.
+            DataError: the mean or the range of temperatures is outside that of all places.
         """
         outdoor = self.outdoor_c
         mean, spread = float(outdoor.values.mean()), float(np.ptp(outdoor.values))
@@ -147,20 +147,20 @@ class Weather:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SiteData(Weather):
-    """Weather and grid carbon intensity of one site on one clock.
+    """Weather and grid carbon intensity of one site, on one clock.
 
-    The series may differ in resolution and in length; ``resample`` brings each to the step of a
-    simulation.
+    The series may differ in resolution and length. ``resample`` converts each of them to the time
+    step of a simulation.
     """
 
     name: str
-    """Name by which configurations refer to the site."""
+    """Name of the site in configurations."""
     ci_g_per_kwh: Series
     """Carbon intensity of the grid, in g CO2e/kWh."""
 
     @property
     def series(self) -> tuple[Series, ...]:
-        """All series that are known, temperatures first."""
+        """All known series, temperatures first."""
         every = (
             self.outdoor_c,
             self.wet_bulb_c,
@@ -172,12 +172,12 @@ class SiteData(Weather):
 
     @property
     def synthetic(self) -> bool:
-        """Whether any of the three driving series was generated."""
+        """True if dry bulb, wet bulb or carbon intensity was generated."""
         return any(s.synthetic for s in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh))
 
 
 def step_minutes(steps_per_hour: int) -> int:
-    """Length of a step in minutes.
+    """Return the length of a step, in minutes.
 
     Raises:
         DataError: ``steps_per_hour`` does not divide 60 minutes.
@@ -192,21 +192,21 @@ def step_minutes(steps_per_hour: int) -> int:
 
 
 def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> FloatArray:
-    """Values of a series at the time step of a simulation.
+    """Convert a series to the time step of a simulation.
 
-    To a finer step, values are interpolated linearly between interval centres, periodically at
-    the wrap, so the year is neither stretched nor shifted; with ``hold`` (flows such as work)
-    each value is kept over its interval instead. To a coarser step, values are averaged by
-    overlap. Averaging and holding conserve the mean; interpolation does so when the step divides
-    the resolution.
+    For a finer step, values are interpolated linearly between the centres of intervals, with the
+    last interval next to the first. This neither stretches nor shifts the year. With ``hold`` (for
+    flows such as work), each value applies to its whole interval instead. For a coarser step,
+    values are averaged by overlap. Averaging and holding conserve the mean; interpolation does so
+    if the step divides the resolution.
 
     Args:
-        series: the series, resolution ``series.minutes``.
-        steps_per_hour: a divisor of 60.
-        hold: keep values over their interval instead of interpolating.
+        series: the series, with resolution ``series.minutes``.
+        steps_per_hour: number of steps per hour, a divisor of 60.
+        hold: True to hold values over their interval instead of interpolating.
 
     Returns:
-        Shape (N,), float64, N = length of the series / step.
+        Values, (N,), float64; N is the length of the series divided by the step.
 
     Raises:
         DataError: the step does not divide an hour, or the series is not a whole number of steps.
@@ -242,8 +242,8 @@ def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> Floa
 
 
 def _mean_by_overlap(values: FloatArray, n: int) -> FloatArray:
-    """Values on n equal intervals: the mean of what overlaps each, weighted by the overlap."""
-    mean = values.mean()  # subtracted first, so that the running sum stays small
+    """Return values on n equal intervals: the mean of the input, weighted by overlap."""
+    mean = values.mean()  # subtracted to keep the running sum small
     total = np.concatenate([[0.0], np.cumsum(values - mean)])
     edges = np.linspace(0.0, values.size, n + 1)
     return np.asarray(
@@ -253,16 +253,16 @@ def _mean_by_overlap(values: FloatArray, n: int) -> FloatArray:
 
 
 def check_physical(name: str, values: ArrayLike, low: float, high: float) -> None:
-    """Reject values outside low..high.
+    """Check that all values are from ``low`` to ``high``.
 
     Args:
-        name: what the values are, for the message.
-        values: any shape.
-        low: least valid value.
-        high: greatest valid value.
+        name: name of the quantity, for the message.
+        values: values of any shape.
+        low: smallest valid value.
+        high: largest valid value.
 
     Raises:
-        DataError: names the first index outside.
+        DataError: a value is outside; the message names the first index.
     """
     array: Any = np.asarray(values, dtype=np.float64)
     good = (array >= low) & (array <= high)
@@ -273,16 +273,16 @@ def check_physical(name: str, values: ArrayLike, low: float, high: float) -> Non
 
 
 def statistics(series: Series) -> dict[str, float]:
-    """Statistics of the hourly means of a series of whole years.
+    """Compute statistics of the hourly means of a series of whole years.
 
     Args:
-        series: any resolution that divides or is a multiple of an hour.
+        series: series whose resolution divides an hour or is a multiple of it.
 
     Returns:
         ``mean``, ``std``, ``min``, ``p1``, ``p50``, ``p99``, ``max`` in the series' unit;
-        ``diurnal`` and ``seasonal``: range of the mean by hour of day and by month;
-        ``daily_std``: mean over days of the standard deviation within the day;
-        ``acf1``, ``acf24``: correlation with the value 1 and 24 hours earlier.
+        ``diurnal`` and ``seasonal``: range of the means by hour of the day and by month;
+        ``daily_std``: standard deviation within a day, mean over all days;
+        ``acf1``, ``acf24``: autocorrelation at lags of 1 and 24 hours.
 
     Raises:
         DataError: the series is not a whole number of 365-day years.

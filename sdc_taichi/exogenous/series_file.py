@@ -1,7 +1,7 @@
-"""The Parquet format that `data import` writes: series of one kind with their provenance.
+"""Parquet format of imported data: series of one kind, with their provenance.
 
-Columns are the series by name, rows the intervals of the simulator's clock; the schema metadata
-holds JSON with format, kind, name, resolution, source and notes.
+Each column is a series, and each row an interval of the simulator's clock. The schema metadata
+contains JSON with format, kind, name, resolution, source and notes. `data import` writes it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 METADATA_KEY = b"sdc_taichi"
-"""Key of the JSON in the metadata of the Parquet schema."""
+"""Key in the metadata of the Parquet schema under which the JSON is stored."""
 FORMAT = "sdc-series/1"
-"""Version of the format."""
+"""Name and version of the format."""
 
 
 def write_parquet(
     path: Path, columns: Mapping[str, FloatArray], metadata: Mapping[str, Any]
 ) -> None:
-    """Write columns with metadata, atomically: a reader sees the old file or the whole new one.
+    """Write columns with metadata atomically: readers see the old file or the complete new one.
 
     Raises:
         DataError: the file cannot be written.
@@ -50,10 +50,10 @@ def write_parquet(
 
 
 def read_metadata(path: Path) -> dict[str, Any] | None:
-    """Metadata of a Parquet file that `data import` wrote; None if it is another Parquet file.
+    """Return the metadata of a file that `data import` wrote; None for other Parquet files.
 
     Raises:
-        DataError: not readable, or metadata of another version.
+        DataError: the metadata are not readable, or have another version.
     """
     raw = (read_schema(path).metadata or {}).get(METADATA_KEY)
     if raw is None:
@@ -69,10 +69,10 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
 
 
 def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type) -> Any:
-    """One metadata value of the expected type.
+    """Return one metadata value, checked for the expected type.
 
     Raises:
-        DataError: missing or of another type.
+        DataError: the value is missing or has another type.
     """
     value = metadata.get(key)
     good = isinstance(value, int | float) if kind is float else isinstance(value, kind)
@@ -82,30 +82,30 @@ def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type
 
 
 class Quantity(NamedTuple):
-    """A quantity of a file: its unit and the limits of its values."""
+    """Unit and valid range of a quantity in a file."""
 
     unit: str
     """Unit of the values."""
     low: float
-    """Least valid value."""
+    """Smallest valid value."""
     high: float
-    """Greatest valid value."""
+    """Largest valid value."""
 
 
 def read_series(
     path: Path, metadata: Mapping[str, Any], kind: str, quantities: Mapping[str, Quantity]
 ) -> dict[str, Series]:
-    """Series of a Parquet file that `data import` wrote, checked like any other input.
+    """Read series from a Parquet file that `data import` wrote, and check them like other input.
 
     Args:
         path: the file.
         metadata: metadata of the file.
-        kind: kind of data that is expected: ``weather``, ``carbon`` or ``workload``.
+        kind: expected kind of data: ``weather``, ``carbon`` or ``workload``.
         quantities: quantities to read, by the names of their columns.
 
     Raises:
-        DataError: data of another kind, or a column that is missing, not numeric, not finite,
-            beyond its limits, or shorter than a year.
+        DataError: the data are of another kind, or a column is missing, not numeric, not finite,
+            outside its limits, or shorter than a year.
     """
     if (stored := metadata_value(path, metadata, "kind", str)) != kind:
         raise DataError(f"{path}: metadata kind: {shortened(stored)}, expected {kind!r}")
@@ -131,7 +131,7 @@ def read_series(
 
 
 def _column(path: Path, table: pa.Table, name: str, quantity: Quantity) -> FloatArray:
-    """Values of a column, all within the limits of its quantity."""
+    """Return the values of a column, checked against the limits of its quantity."""
     if name not in table.column_names:
         raise DataError(f"{path}: missing column {name}; found {', '.join(table.column_names)}")
     try:
@@ -148,9 +148,9 @@ def _column(path: Path, table: pa.Table, name: str, quantity: Quantity) -> Float
 
 
 def column_names(path: Path) -> list[str]:
-    """Names of the columns of a Parquet file.
+    """Return the column names of a Parquet file.
 
     Raises:
-        DataError: not readable.
+        DataError: the file is not readable.
     """
     return [str(name) for name in read_schema(path).names]

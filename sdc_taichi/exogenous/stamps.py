@@ -1,8 +1,8 @@
-"""Meaning of the stamps of a carbon file: the start or the end of their interval.
+"""Detection of whether the stamps of a carbon file mark the start or the end of an interval.
 
-EIA-930 stamps mark the end of the hour, but some authorities report the start, or did so until some
-day. Solar generation shows which: its centre of gravity is after solar noon where stamps mark the
-end of the hour, and before it where they mark the start.
+EIA-930 stamps mark the end of the hour, but some authorities report the start, or did so until a
+certain day. Solar generation shows the difference: its centre of gravity is after solar noon if
+stamps mark the end of the hour, and before it if they mark the start.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
 MOST_LATENESS_H = 1.5
-"""Largest distance of the centre of solar generation from solar noon at the site, in h: half an
-hour for what stamps mark, and an hour for 15 degrees of longitude that solar plants may lie away.
-Arizona has the largest of the embedded sites, 1.1 h."""
+"""Largest valid distance of the centre of solar generation from solar noon at the site, in h. Half
+an hour is for the meaning of stamps, and an hour for solar plants up to 15 degrees of longitude
+away. The largest distance of an embedded site is 1.1 h, in Arizona."""
 Stamp = Literal["auto", "start", "end"]
-"""Moment of its interval that a stamp marks; ``auto`` infers it from the solar generation."""
+"""Moment of its interval that a stamp marks; ``auto`` infers it from solar generation."""
 
 HAS_OFFSET = r"(?:[Zz]|UTC|[+-]\d\d:?\d\d)$"
-"""Regular expression of a UTC offset at the end of a stamp."""
+"""Regular expression for a UTC offset at the end of a stamp."""
 
 
 def by_start_of_interval(
@@ -33,10 +33,10 @@ def by_start_of_interval(
     minutes: float,
     noon_h: float,
 ) -> tuple[FloatArray, int, str]:
-    """Values in the order in which their intervals begin.
+    """Return one value per interval, in the order of the intervals.
 
     Args:
-        stamp: what a stamp marks, or ``auto`` to read it from the solar generation.
+        stamp: moment that a stamp marks, or ``auto`` to infer it from solar generation.
         intensity: values in the order of the file, (T,).
         solar: solar generation in the order of the file, any unit, (T,); None if not known.
         local: first stamp, in local standard time.
@@ -44,8 +44,8 @@ def by_start_of_interval(
         noon_h: mean solar noon, in hours of local standard time.
 
     Returns:
-        One value per interval, (T,) or one more or less; by how many intervals the first one begins
-        before its stamp (0 or 1); and a note.
+        Values, (T,) or one more; number of intervals by which the first interval begins before its
+        stamp (0 or 1); and a note.
     """
     if stamp != "auto":
         return intensity, int(stamp == "end"), f"stamps mark the {stamp} of the interval (given)"
@@ -71,7 +71,7 @@ def by_start_of_interval(
 def region_notes(
     solar: FloatArray, local: np.datetime64, minutes: float, noon_h: float
 ) -> list[str]:
-    """Warning of solar generation that does not fit the longitude of the site, or an empty list.
+    """Return a warning if solar generation does not fit the site's longitude, else an empty list.
 
     Args:
         solar: solar generation in the order of the file, any unit, (T,).
@@ -93,9 +93,9 @@ def region_notes(
 def _solar_lateness(
     solar: FloatArray, local: np.datetime64, minutes: float, noon_h: float
 ) -> FloatArray | None:
-    """Hours from solar noon to the centre of solar generation by stamp, per day; NaN on dark days.
+    """Return hours from solar noon to the centre of solar generation, per day; NaN on dark days.
 
-    Mean solar noon is corrected by the equation of time (Spencer 1971).
+    The equation of time (Spencer 1971) corrects the mean solar noon.
     """
     times = local.astype("datetime64[s]") + np.timedelta64(round(minutes * 60), "s") * np.arange(
         solar.size
@@ -128,10 +128,10 @@ def _solar_lateness(
 
 
 def _best_split(lateness: FloatArray) -> tuple[float, float, int]:
-    """Means before and after the day that best splits the series in two, and that day.
+    """Return the means before and after the day that best splits the series in two, and that day.
 
-    A split counts only if both parts last 30 days and differ by 0.4 h (a change of what a stamp
-    marks is an hour); otherwise both means are that of the whole.
+    A split counts only if both parts last 30 days and differ by 0.4 h (a change in the meaning of
+    stamps is an hour). Otherwise both means are the median of the whole series.
     """
     days = np.flatnonzero(~np.isnan(lateness))
     values = lateness[days]
