@@ -1,7 +1,7 @@
 """Environments for reinforcement learning: PettingZoo, Gymnasium and batches around one core.
 
-Observations, rewards, action spaces and recordings of episodes live here.
-Physics never does: an environment only translates between a learner and the simulator.
+This package defines observations, rewards, action spaces and recordings of episodes. It contains
+no physics: an environment only translates between a learner and the simulator.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ IDS: dict[str, str | None] = {
     "sdc_taichi/Cooling-v0": "agent_dc",
     "sdc_taichi/Battery-v0": "agent_bat",
 }
-"""Gymnasium ids of the environments, and the one agent that learns in each; None is all ``agents``
-as one."""
+"""Gymnasium ids of the environments, each with its only learning agent. None stands for one
+learner that controls all ``agents``."""
 
 
 def register(gymnasium: ModuleType) -> None:
-    """Register the ids that are not registered yet; the environments are imported by ``make``.
+    """Register the Gymnasium ids of ``IDS`` that are not registered yet.
 
-    The length of an episode depends on the arguments: ``max_episode_steps`` is in the spec of each
-    environment (``sdc_taichi.envs.base``).
+    ``gymnasium.make`` imports the environments. The length of an episode depends on the arguments,
+    so each environment sets ``max_episode_steps`` in its own spec (``sdc_taichi.envs.base``).
 
     Args:
-        gymnasium: the package Gymnasium.
+        gymnasium: the module ``gymnasium``.
     """
     for name, agent in IDS.items():
         if name not in gymnasium.registry:

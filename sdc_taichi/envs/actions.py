@@ -17,31 +17,31 @@ from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
 from sdc_taichi.types import F64, Actions, State
 
 BATTERY_COMMANDS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
-"""Commands of the battery's discrete actions 0, 1 and 2 by ``action_order``: 1 charges, -1
-discharges."""
+"""Battery commands of the discrete actions 0, 1 and 2, by ``action_order``: 1 charges, 0 holds,
+-1 discharges."""
 PLACEMENT_FACTOR = 10.0
-"""Relative load of a rack at an action of 1; an action of -1 gives the reciprocal."""
+"""Placement weight of a rack at a continuous action of 1; an action of -1 gives the reciprocal."""
 _NEUTRAL = {"placement": 1.0}
-"""Neutral values of commands whose neutral value is not 0."""
+"""Neutral values of the commands that are not neutral at 0."""
 _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
-"""Stage and model that each command requires."""
+"""Simulation stage, and the model of this stage, that a command requires."""
 
 
 class AgentActions:
     """Converts actions of agents to commands of the simulator and back.
 
     Args:
-        fleet: the data centers, B.
+        fleet: the B data centers, with U CRAC units and R racks in total.
         options: learning agents, their commands and the meaning of their actions.
 
     Attributes:
-        spaces: space of the actions of each agent in one environment.
-        commands: commands that learning agents decide.
-        action_order: order of the battery's discrete actions.
+        spaces: action space of each learning agent in one environment.
+        commands: names of the commands that learning agents decide.
+        action_order: order of the battery's discrete actions, ``paper`` or ``sustaindc``.
 
     Raises:
-        ConfigError: data centers with different numbers of racks or units that actions command, or
-            with a model that does not take a command.
+        ConfigError: the data centers differ in the number of CRAC units or racks that actions
+            control, or a model of the fleet does not accept a command.
     """
 
     def __init__(self, fleet: Fleet, options: EnvOptions) -> None:
@@ -84,15 +84,16 @@ class AgentActions:
         self._fan_steps = options.fan_change / np.repeat(fleet.values("hvac.crac.fan_step"), units)
 
     def decode(self, actions: Mapping[str, Any], state: State) -> dict[str, F64]:
-        """Commands of the learning agents by name, each (B,), (U,) or (R,).
+        """Convert actions to commands of the simulator by name, each (B,), (U,) or (R,).
 
         Args:
-            actions: one entry per learning agent, (B,) whole numbers, or (B, k) numbers with
-                continuous actions or several numbers to an action.
+            actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
+                the agent decides k values; continuous actions are floats, (B, k).
             state: state of the simulator before the step.
 
         Raises:
-            SdcError: actions that are missing, too many, or outside their space.
+            SdcError: the actions of an agent are missing or outside their space, or there are
+                actions of an agent that does not learn.
         """
         if not isinstance(actions, Mapping):
             raise SdcError(f"actions: {actions!r}; valid is a dict of {list(self._agents)}")
@@ -108,10 +109,10 @@ class AgentActions:
         return commands
 
     def encode(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
-        """Actions of the learning agents that approximate commands most closely.
+        """Convert commands to the nearest actions of the learning agents.
 
         Args:
-            commands: commands of one step, named or numeric.
+            commands: commands of one step, as enum members or numbers.
 
         Returns:
             Actions by learning agent, in the form that ``decode`` takes.
@@ -137,7 +138,7 @@ class AgentActions:
             else:
                 (name, _), *_ = self._columns[agent]
                 commands = self._discrete_commands[name]
-                # Only the battery has its neutral action elsewhere than in the middle.
+                # The neutral action is 1, except that of the battery, which depends on the order.
                 idle[agent] = np.full(shape, 1 if name != "battery" else np.argmin(abs(commands)))
         return idle
 
@@ -147,7 +148,7 @@ class AgentActions:
         return spaces.Discrete(3) if width == 1 else spaces.MultiDiscrete([3] * width)
 
     def _checked(self, agent: str, actions: Mapping[str, Any]) -> npt.NDArray[Any]:
-        """Checked action of one agent, as int64 or float64."""
+        """Check the shape and values of one agent's action; return it as int64 or float64."""
         if agent not in actions:
             raise SdcError(f"actions: none for {agent}; valid: {list(self._agents)}")
         action = checked_array(actions[agent], f"action of {agent}")
@@ -160,7 +161,7 @@ class AgentActions:
         whole = action.dtype.kind in "iu"
         if whole:
             choices = action.astype(np.int64)
-            # As unsigned numbers, negative choices exceed 2 as well.
+            # Viewed as unsigned integers, negative choices also exceed 2: one comparison suffices.
             if np.maximum.reduce(choices.view(np.uint64), axis=None) <= 2:
                 return choices
             action = action[(action < 0) | (action > 2)]
@@ -168,7 +169,7 @@ class AgentActions:
         raise SdcError(f"action of {agent}: {action.flat[0]}{kind}; valid is 0, 1 or 2")
 
     def _command(self, name: str, action: npt.NDArray[Any], state: State) -> F64:
-        """Command of the part of an action that belongs to it, each (B,), (U,) or (R,)."""
+        """Convert the part of an action that sets command ``name``, (B,), (U,) or (R,)."""
         if not self._continuous:
             return self._discrete_commands[name].take(action)
         if name == "placement":
@@ -181,7 +182,7 @@ class AgentActions:
         return action
 
     def _action(self, name: str, command: F64) -> npt.NDArray[Any]:
-        """Part of an action that approximates a command most closely, (B, k)."""
+        """Return the part of an action that is nearest to a value of command ``name``, (B, k)."""
         if name == "placement":
             command = np.log10(command)
         if not self._continuous:
@@ -198,11 +199,11 @@ class AgentActions:
 
 
 def as_numbers(command: Any, neutral: float = 0.0) -> F64:
-    """Numeric values of a command of ``Actions``, which may be an enum member.
+    """Return the numeric values of a command of ``Actions``.
 
     Args:
-        command: the command.
-        neutral: value of a command that is None.
+        command: number, array, enum member or None.
+        neutral: numeric value that replaces None.
     """
     if command is None:
         command = neutral
@@ -210,14 +211,14 @@ def as_numbers(command: Any, neutral: float = 0.0) -> F64:
 
 
 def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:
-    """Number of units or racks per data center, which all data centers must share.
+    """Return the number of units or racks per data center, which must be the same in all.
 
     Args:
-        offsets: index of each data center's first unit or rack, and the total, (B + 1,).
-        what: plural of the counted thing, for errors.
+        offsets: index of each data center's first unit or rack, then the total number, (B + 1,).
+        what: plural noun for the units or racks in error messages.
 
     Raises:
-        ConfigError: data centers with different numbers.
+        ConfigError: the data centers have different numbers.
     """
     numbers = np.diff(offsets)
     if np.any(numbers != numbers[0]):
@@ -229,10 +230,10 @@ def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:
 
 
 def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
-    """Refuse commands that the models of the fleet do not take.
+    """Refuse commands that the models of the fleet do not accept.
 
     Raises:
-        ConfigError: naming the field of the config, its value and what would be valid.
+        ConfigError: the error names the field of the config, its value and the valid value.
     """
     for name, (stage, needed) in _NEEDED_MODELS.items():
         model = fleet.models[stage]
@@ -245,7 +246,7 @@ def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
 def _columns(
     names: Sequence[str], widths: Mapping[str, int]
 ) -> tuple[tuple[str, slice | None], ...]:
-    """Commands of an agent and their columns in its action; None means all columns."""
+    """Return each command of an agent with its columns in the action; None means all columns."""
     if len(names) == 1:
         return ((names[0], None),)
     ends = np.cumsum([widths.get(name, 1) for name in names]).tolist()
@@ -256,7 +257,7 @@ def _columns(
 
 
 def _checked_numbers(agent: str, action: npt.NDArray[Any]) -> F64:
-    """Checked continuous action; values beyond -1..1 by rounding of f32 are clipped."""
+    """Check a continuous action and clip values that exceed -1..1 by rounding in f32."""
     if action.dtype.kind not in "iuf":
         raise SdcError(f"action of {agent}: {action.flat[0]!r}; valid is a number")
     inside = np.abs(action) <= 1.0 + 1e-6
@@ -269,11 +270,11 @@ def checked_array(given: Any, name: str) -> npt.NDArray[Any]:
     """Convert a user's number, array or nested lists to an array of any type and shape.
 
     Args:
-        given: the value.
-        name: name of the value in errors.
+        given: number, array or nested lists.
+        name: name of the value in error messages.
 
     Raises:
-        SdcError: nested lists of differing lengths.
+        SdcError: the nested lists have different lengths.
     """
     try:
         return np.asarray(given)

@@ -19,16 +19,16 @@ class AgentDefinition:
     """Commands, default features and reward scales of an agent."""
 
     command: str
-    """Field of ``Actions`` that the agent sets by default, and the part of a controller spec
-    that stands for it."""
+    """Field of ``Actions`` that the agent sets by default. It also names the agent's part in
+    controller specifications such as ``load=name,cooling=name``."""
     features: tuple[str, ...]
-    """Features that the agent observes by default."""
+    """Names of the features that the agent observes by default, in order."""
     scales: dict[str, dict[str, float]]
-    """Scales of its reward terms, by reward set and term."""
+    """Factors of the agent's reward terms, by reward set and term."""
 
     @property
     def commands(self) -> tuple[str, ...]:
-        """Fields of ``Actions`` that the agent can set, the default one first."""
+        """Names of all fields of ``Actions`` that the agent can set, the default field first."""
         return COMMANDS_OF_PART[self.command]
 
 
@@ -70,24 +70,26 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
 }
 """Definitions of all agents by name.
 
-Default features are the paper's lists (A.1.2, A.2.4, A.3.3) with ages of the queue and weather for
-the load agent, the coming work for the cooling agent, and the change of the carbon intensity.
+The default features are the lists of the paper (A.1.2, A.2.4, A.3.3) with three additions: queue
+ages and weather for the load agent, arriving work for the cooling agent, and the change of the
+carbon intensity for the load and battery agents.
 
-Reward set ``default`` charges each agent for the part of the carbon that it can change, ``bill``
-does the same with prices and high power. ``paper`` is r_LS, r_DC and r_BAT of the paper (4.5, F.2),
-with carbon and energies divided by those of the design point.
+Reward set ``default`` charges each agent for the part of the carbon emissions that it can change.
+Reward set ``bill`` uses prices instead of carbon intensity and adds a charge for high power. Reward
+set ``paper`` contains r_LS, r_DC and r_BAT of the paper (4.5, F.2), with carbon and energies
+divided by their values at the design point.
 """
 
 
 def commands_by_others(
     agents: Sequence[str], decided: Sequence[str], offered: Sequence[str]
 ) -> list[str]:
-    """Commands that a controller gives for the agents that do not learn.
+    """Return the names of the commands that a controller sets for the agents that do not learn.
 
     Args:
-        agents: agents that learn.
-        decided: commands that the learning agents decide.
-        offered: commands that the controller gives.
+        agents: names of the agents that learn.
+        decided: names of the commands that the learning agents decide.
+        offered: names of all commands that the controller can set.
     """
     settable = dict.fromkeys(
         command

@@ -1,4 +1,4 @@
-"""Arguments, infos, methods and specs that all environments share."""
+"""Common base of all environments: constructor arguments, infos, methods and Gymnasium specs."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from sdc_taichi.types import F32, F64
 from sdc_taichi.user_functions import import_path
 
 RESET_OPTIONS = ("start_day",)
-"""Names that ``reset(options=...)`` takes."""
+"""Valid keys of ``options`` in ``reset(options=...)``."""
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 """Metadata of all environments, as Gymnasium and PettingZoo define them."""
 
 
 class Environment:
-    """Attributes and methods of all environments beyond Gymnasium and PettingZoo."""
+    """Base of all environments: attributes and methods that Gymnasium and PettingZoo lack."""
 
     core: Core
-    """The data centers."""
+    """Batch of data centers that the environment wraps."""
     render_mode: str | None
     """None or ``rgb_array``."""
     state_space: spaces.Space[Any]
@@ -61,23 +61,23 @@ class Environment:
         recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
-        """Make the data centers from the arguments of an entry point.
+        """Create the data centers from the arguments of an environment's constructor.
 
         Args:
-            config: a preset, a file, a config or a dict of its sections; for batches several of
-                the latter two, of which environment i takes entry i modulo their number.
-            num_envs: number of environments; None is one per config.
-            only_agent: the learning agent, if the entry point has a single one.
-            overrides: values put into every config: a dict of section.key to value, or a list of
-                ``section.key=value``.
-            options: options; None is the default ones.
-            precision: precision of the server kernels, ``f32`` or ``f64``.
+            config: a preset, a file, a config or a dict of its sections. A batch also takes a list
+                of configs or dicts; environment i uses entry i modulo the length of the list.
+            num_envs: number of environments; None creates one per config.
+            only_agent: the learning agent of an environment with a single agent; None otherwise.
+            overrides: values that replace those of every config: a dict from section.key to value,
+                or a list of ``section.key=value``.
+            options: options of the environment; None means the default options.
+            precision: floating-point precision of the server kernels, ``f32`` or ``f64``.
             render_mode: None or ``rgb_array``.
-            recorder: records episodes: a file ending in .rrd, or an ``EpisodeRecorder``.
+            recorder: destination of recordings: a file ending in .rrd, or an ``EpisodeRecorder``.
             keywords: fields of ``EnvOptions``, which take precedence over ``options``.
 
         Raises:
-            SdcError: a config, number or option that is not valid.
+            SdcError: a config, number or option is not valid.
         """
         check_render_mode(render_mode)
         configs, chosen = configs_and_options(config, overrides, options, keywords, only_agent)
@@ -94,56 +94,57 @@ class Environment:
         return frame(self.core.view, env)
 
     def state_dict(self) -> dict[str, Any]:
-        """Picklable state from which ``load_state_dict`` continues the episodes exactly."""
+        """Return a picklable state from which ``load_state_dict`` continues bit for bit."""
         return self.core.state_dict()
 
     def close(self) -> None:
-        """Close the simulator, which is unusable afterwards."""
+        """Close the simulator; the environment cannot be used afterwards."""
         self.core.close()
 
 
 class SingleEnv(Environment):
-    """Methods of environments with one data center beyond Gymnasium and PettingZoo."""
+    """Base of environments with one data center."""
 
     def state(self) -> F32:
-        """Shared state for centralised critics, (m,), of ``state_space``."""
+        """Return the shared state for centralised critics, an element of ``state_space``, (m,)."""
         return np.asarray(self.core.state()[0])
 
     def reward_terms(self) -> dict[str, float]:
-        """All reward terms of the last step by name, unscaled; empty before the first."""
+        """Return all reward terms of the last step by name, unscaled; empty before any step."""
         return as_floats(self.core.reward_terms())
 
     def render(self) -> Image:
-        """Picture of the hall after the last step, (height, width, 3).
+        """Return a picture of the hall after the last step, (height, width, 3).
 
         Raises:
-            ConfigError: made without ``render_mode``.
+            ConfigError: the environment was created without ``render_mode``.
         """
         return self._frame(0)
 
 
 class BatchEnv(Environment):
-    """Methods of batches of environments beyond Gymnasium."""
+    """Base of batches of B environments."""
 
     num_envs: int
     """Number of environments, B."""
 
     def state(self) -> F32:
-        """Shared state for centralised critics, (B, m)."""
+        """Return the shared state of each environment for centralised critics, (B, m)."""
         return self.core.state()
 
     def reward_terms(self) -> dict[str, F64]:
-        """All reward terms of the last step by name, (B,) each, unscaled; empty before the first.
+        """Return all reward terms of the last step by name, unscaled, (B,) each.
 
-        After a step that ends episodes and starts the next ones, they belong to that step.
+        The dict is empty before the first step. If the last step ended the episodes and started the
+        next ones, the terms still belong to that step.
         """
         return self.core.reward_terms()
 
     def render(self) -> tuple[Image, ...]:
-        """Picture of the hall of each environment after the last step, (height, width, 3) each.
+        """Return a picture of each hall after the last step, (height, width, 3) each.
 
         Raises:
-            ConfigError: made without ``render_mode``.
+            ConfigError: the environment was created without ``render_mode``.
         """
         return tuple(self._frame(i) for i in range(self.core.num_envs))
 
@@ -157,18 +158,18 @@ class AgentSpaces:
     """Space of the actions of one environment, by agent."""
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's observations in one environment.
+        """Return the observation space of an agent in one environment.
 
         Raises:
-            ConfigError: an agent that does not learn here.
+            ConfigError: the agent does not learn in this environment.
         """
         return _space_of(agent, self.observation_spaces)
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's actions in one environment.
+        """Return the action space of an agent in one environment.
 
         Raises:
-            ConfigError: an agent that does not learn here.
+            ConfigError: the agent does not learn in this environment.
         """
         return _space_of(agent, self.action_spaces)
 
@@ -180,15 +181,15 @@ def _space_of(agent: str, by_agent: Mapping[str, spaces.Space[Any]]) -> spaces.S
 
 
 def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
-    """Option ``start_day`` of ``reset``, or None.
+    """Check the options of ``reset`` and return ``start_day``, or None without it.
 
     Args:
         options: values by name.
-        strict: whether an unknown name is an error instead of a warning. PettingZoo's own API test
-            passes an unknown option, so its environments only warn.
+        strict: True if an unknown name is an error, False if it is a warning. PettingZoo
+            environments only warn, because PettingZoo's own API test passes an unknown option.
 
     Raises:
-        ConfigError: an unknown option.
+        ConfigError: an option is unknown and ``strict`` is True, or ``options`` is no dict.
     """
     if options is not None and not isinstance(options, Mapping):
         raise ConfigError(f"reset options {options!r}: valid is a dict")
@@ -203,43 +204,44 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
 
 
 def first_info(core: Core) -> dict[str, Any]:
-    """Infos of the first environment before its first step, as numbers and text."""
+    """Return the infos of the batch's first environment after a reset, as numbers and text."""
     return {name: values.tolist()[0] for name, values in core.start_info().items()}
 
 
 def step_info(transition: Transition) -> dict[str, F64]:
-    """Quantities and costs of a step by name, (B,) each."""
+    """Return all quantities of a step's result and its costs by name, (B,) each."""
     info = transition.result.per_dc()
     info.update(transition.costs)
     return info
 
 
 def as_floats(quantities: Mapping[str, F64]) -> dict[str, float]:
-    """Quantities of a batch of one, (1,) each, as numbers."""
+    """Convert the arrays of a batch of one environment, (1,) each, to floats."""
     return {name: values.item() for name, values in quantities.items()}
 
 
 def first_of_batch(observation: Observation) -> Observation:
-    """The first observation of a batch, (n,) of (B, n)."""
+    """Return the observation of a batch's first environment: (n,) from (B, n)."""
     if isinstance(observation, dict):
         return {name: values[0] for name, values in observation.items()}
     return np.asarray(observation[0])
 
 
 class HasSpec:
-    """Spec of an environment that ``gymnasium.make`` or ``make_vec`` made."""
+    """Mixin with the spec of an environment from ``gymnasium.make`` or ``gymnasium.make_vec``."""
 
     core: Core
-    """The data centers."""
+    """Batch of data centers that the environment wraps."""
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Arguments as plain values, and the length of an episode; None if made without an id.
+        """Gymnasium's spec: constructor arguments as plain values, and the episode length.
 
-        ``gymnasium.make`` or ``make_vec`` makes the same environment from the spec or from
-        ``EnvSpec.from_json(spec.to_json())``. Arguments without a plain form are kept as they are:
-        a recorder that is not a path, a function that cannot be imported, a controller object.
+        The spec is None if the environment was created without a Gymnasium id. ``gymnasium.make``
+        or ``make_vec`` creates the same environment from the spec or from
+        ``EnvSpec.from_json(spec.to_json())``. Three kinds of arguments have no plain form and stay
+        objects: recorders other than paths, functions that cannot be imported, and controllers.
         """
         return self._spec
 
@@ -253,14 +255,14 @@ class HasSpec:
 
 
 def check_steps(given: Any, core: Core) -> int:
-    """Number of steps of an episode with Gymnasium's argument ``max_episode_steps``.
+    """Return the number of steps of an episode under Gymnasium's argument ``max_episode_steps``.
 
     Args:
-        given: the argument; None and -1 are no limit.
-        core: the data centers.
+        given: value of ``max_episode_steps``; None and -1 mean no limit.
+        core: batch of data centers.
 
     Raises:
-        ConfigError: not a whole number, or more steps than an episode has.
+        ConfigError: ``given`` is not an integer, or exceeds the length of an episode.
     """
     if given is None or (given == -1 and not isinstance(given, bool)):
         return core.steps
@@ -274,7 +276,7 @@ def check_steps(given: Any, core: Core) -> int:
 
 
 def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of an entry point as plain values, with fields of ``options`` as keywords."""
+    """Return constructor arguments as plain values, with fields of ``options`` as keywords."""
     values = dict(arguments)
     options = values.pop("options", None)
     if isinstance(options, EnvOptions):
@@ -284,11 +286,12 @@ def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:
-    """Value as JSON types, or the value itself.
+    """Return a value as JSON types, or the value itself if it has no such form.
 
     Args:
         value: any value.
-        known: plain form of each model by its id, since configs of a batch are often the same.
+        known: cache of the plain forms of Pydantic models, by ``id``. The environments of a batch
+            often share one config.
     """
     if isinstance(value, BaseModel):
         if id(value) not in known:
@@ -310,7 +313,7 @@ def _plain(value: Any, known: dict[int, Any]) -> Any:
 
 
 def _path_of(function: Callable[..., Any]) -> Any:
-    """Import path of a function, or the function if no path imports it in another process."""
+    """Return the import path of a function, or the function if other processes cannot import it."""
     path = import_path(function)
     module, _, name = path.partition(":")
     if module != "__main__":

@@ -55,8 +55,8 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
 
 Observation = F32 | dict[str, F32]
-"""Observations, (B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B,
-rows, racks per row, channels)."""
+"""Observations of one agent in B environments: an array (B, n), or with option ``heat_map`` a dict
+of ``features``, (B, n), and ``heat_map``, (B, rows, racks per row, channels)."""
 
 
 @dataclass(slots=True)
@@ -68,12 +68,12 @@ class Transition:
     rewards: dict[str, F64]
     """Rewards by learning agent, (B,) each."""
     joint_reward: F64
-    """Reward of all learning agents as one, (B,)."""
+    """Reward of a single learner that controls all learning agents, (B,)."""
     costs: dict[str, F64]
-    """Costs that the option ``costs`` names: ``cost``, their weighted sum, and ``cost_NAME`` for
-    each, (B,) each; empty without the option."""
+    """Costs of the step, (B,) each: ``cost_NAME`` for each cost of the option ``costs``, and their
+    weighted sum ``cost``. The dict is empty without the option."""
     ended: bool
-    """Whether the episodes are over; all have the same length."""
+    """True if this step ended the episodes, which all have the same length."""
     result: StepResult
     """Result of the simulator's step."""
 
@@ -82,25 +82,25 @@ class Core:
     """A batch of data centers whose episodes begin and end together.
 
     Args:
-        configs: configs of data centers; environment i takes config i modulo their number.
+        configs: configs of data centers; environment i uses config i modulo their number.
         options: actions, observations and rewards of the agents.
-        num_envs: number of environments; None is one per config.
-        precision: precision of the server kernels.
-        recorder: chosen episodes and destination of recordings; None records nothing.
+        num_envs: number of environments; None creates one per config.
+        precision: floating-point precision of the server kernels.
+        recorder: choice and destination of recorded episodes; None records nothing.
 
     Attributes:
-        options: the options.
-        agents: agents that learn.
+        options: actions, observations and rewards of the agents.
+        agents: names of the agents that learn.
         num_envs: number of environments, B.
         steps: number of steps of an episode.
-        sim: the simulator of all data centers.
-        features: features of each agent, in the order of its observation.
-        observation_spaces: space of each agent's observation in one environment.
-        action_spaces: space of each agent's action in one environment.
+        sim: simulator of all B data centers.
+        features: features of each learning agent, in the order of its observation.
+        observation_spaces: observation space of each learning agent in one environment.
+        action_spaces: action space of each learning agent in one environment.
         state_space: space of the shared state of one environment.
 
     Raises:
-        SdcError: a config, option or number that is not valid.
+        SdcError: a config, option or number is not valid.
     """
 
     def __init__(
@@ -138,7 +138,8 @@ class Core:
             days=options.days,
         )
         self._costs = Costs(options.costs, fleet)
-        # Plain values that identify the environment in saved states; costs change no episode.
+        # Plain values that identify the environment in saved states. Costs are left out because
+        # they do not change an episode.
         self._identity = options.model_dump(exclude={"rewards", "costs", "others"}) | {
             "rewards": self._rewards.identity,
             "others": controller_text(options.others),
@@ -167,13 +168,13 @@ class Core:
         self.record_episodes(recorder)
 
     def end_after(self, steps: int) -> None:
-        """End episodes after fewer steps than their days have.
+        """Shorten all episodes to a number of steps.
 
         Args:
-            steps: number of steps of an episode.
+            steps: number of steps of an episode, at most that of ``EnvOptions.days``.
 
         Raises:
-            ConfigError: an event that would start after the end.
+            ConfigError: a scheduled event would start after the end of the episode.
         """
         fleet = self.sim.fleet
         require_events_start_before(steps / fleet.steps_per_hour, fleet.configs, "the episode")
@@ -183,17 +184,18 @@ class Core:
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i of a sequence. None continues the
-                generator of the environment, or seeds a new one from the system's entropy.
-            start_day: day of the year as ``MM-DD`` or counted from 0, or one for each environment;
-                replaces the option ``start``.
+            seed: environment i uses ``seed + i``, or entry i of a sequence. With None each
+                environment continues its random generator, or seeds a new one from the operating
+                system's entropy.
+            start_day: first day of the episodes as ``MM-DD`` or as number of the day in the year,
+                from 0; or one day for each environment. None uses the option ``start``.
 
         Returns:
             Observations before the first step, by learning agent.
 
         Raises:
-            SdcError: a seed or day that is not valid.
-            RuntimeStateError: after ``close``.
+            SdcError: a seed or day is not valid.
+            RuntimeStateError: the environment is closed.
         """
         self._check_open()
         chosen = None if start_day is None else chosen_start_days(start_day, self.num_envs)
@@ -212,11 +214,12 @@ class Core:
         return observations
 
     def next_episode(self) -> dict[str, Observation]:
-        """Start the next episodes within the step that ended the last ones.
+        """Start the next episodes within the same step that ended the previous ones.
+
+        ``reward_terms`` keeps returning the terms of the step that ended the previous episodes.
 
         Returns:
-            Observations before the first step; ``reward_terms`` stays that of the step that ended
-            the last episodes.
+            Observations before the first step, by learning agent.
         """
         terms = self.reward_terms()
         observations = self.reset()
@@ -236,14 +239,14 @@ class Core:
         self._rewards.reset(view)
 
     def record_episodes(self, recorder: RecorderOption) -> None:
-        """Record chosen episodes, starting with the next.
+        """Record selected episodes, starting with the next episode.
 
         Args:
-            recorder: chosen episodes and destination; None records nothing.
+            recorder: choice and destination of recorded episodes; None records nothing.
 
         Raises:
-            RuntimeStateError: episodes are recorded already.
-            SdcError: a recorder that is not valid.
+            RuntimeStateError: there is a recorder already.
+            SdcError: the recorder is not valid.
         """
         if recorder is None:
             return
@@ -252,20 +255,21 @@ class Core:
         self._recordings = EpisodeRecordings(recorder, self.sim)
 
     def _begin_recording(self) -> None:
-        """Begin the recording of an episode if it is chosen."""
+        """Start recording the new episode if the recorder selects it."""
         if self._recordings is not None:
             self._recordings.begin(self.sim)
 
     def step(self, actions: Mapping[str, Any]) -> Transition:
-        """Advance all environments.
+        """Advance all environments by one step.
 
         Args:
-            actions: one entry per learning agent, (B,) whole numbers, or (B, k) numbers with
-                continuous actions or several CRAC units.
+            actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
+                the agent decides k values; continuous actions are floats, (B, k).
 
         Raises:
-            SdcError: actions that are missing, too many, or outside their space.
-            RuntimeStateError: before ``reset``, or after the end of the episode.
+            SdcError: the actions of an agent are missing or outside their space, or there are
+                actions of an agent that does not learn.
+            RuntimeStateError: the environment has not been reset, or the episode is over.
         """
         view = self.view
         if self.episode_over:
@@ -297,7 +301,7 @@ class Core:
         return transition
 
     def actions_of(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
-        """Actions for ``step`` that approximate commands most closely, by learning agent.
+        """Return the actions for ``step`` that are nearest to commands, by learning agent.
 
         Args:
             commands: commands of one step, for example of a controller.
@@ -306,10 +310,10 @@ class Core:
 
     @property
     def view(self) -> View:
-        """View of the data centers before the next step.
+        """What controllers see of the data centers before the next step.
 
         Raises:
-            RuntimeStateError: before ``reset``, or after ``close``.
+            RuntimeStateError: the environment has not been reset, or is closed.
         """
         if self._view is None:
             self._check_open()
@@ -318,37 +322,38 @@ class Core:
 
     @property
     def episode_over(self) -> bool:
-        """Whether an episode has ended and the next has not begun."""
+        """True if the episodes have ended and the next ones have not begun."""
         return self._view is not None and self._view.state.step >= self.steps
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
-        """Neutral actions of all learning agents, (B,) or (B, k)."""
+        """Return the neutral action of each learning agent, (B,) or (B, k)."""
         return self._decoder.idle_actions()
 
     def start_info(self) -> dict[str, npt.NDArray[Any]]:
-        """Start day and drawn inputs of the present episodes by name, (B,) each.
+        """Return the start day and the randomly drawn inputs of the current episodes, (B,) each.
 
-        ``start_day`` counts from 0 in the year. Option ``years`` adds ``year``, the seed of the
-        synthetic series, and option ``traces`` adds ``trace``.
+        ``start_day`` is the day of the year, from 0. Option ``years`` adds ``year``, the seed of
+        the synthetic series, and option ``traces`` adds ``trace``, the workload trace.
         """
         start = self.view.state.start // self._steps_per_day
         return {"start_day": np.asarray(start, dtype=np.int64), **draw_info(self._draw)}
 
     def state(self) -> F32:
-        """Shared state for centralised critics, (B, m): all features of all agents."""
+        """Return the shared state for centralised critics: all features of all agents, (B, m)."""
         view = self.view
         return self._observer.state(view)
 
     def reward_terms(self) -> dict[str, F64]:
-        """Reward terms of the last step by name, unscaled, (B,) each; empty before the first.
+        """Return the reward terms of the last step by name, unscaled, (B,) each.
 
-        After ``next_episode`` they still belong to the step that ended the previous episode.
+        The dict is empty before the first step. After ``next_episode`` the terms still belong to
+        the step that ended the previous episodes.
         """
         last = self.view.last
         return dict(self._final_terms) if last is None else self._rewards.terms(last)
 
     def state_dict(self) -> dict[str, Any]:
-        """Picklable state from which ``load_state_dict`` continues the episode exactly."""
+        """Return a picklable state from which ``load_state_dict`` continues bit for bit."""
         view = self.view
         state, commands = self._last or (view.state, None)
         return {
@@ -368,8 +373,9 @@ class Core:
             Observations before the next step.
 
         Raises:
-            SdcError: the state belongs to other environments, is incomplete or not valid, and the
-                environments are unchanged; or no step can be done from it, and they need ``reset``.
+            SdcError: the state belongs to other environments, is incomplete or is not valid; the
+                environments are then unchanged. The error is also raised if no step is possible
+                from the state; the environments then need ``reset``.
         """
         self._check_open()
         saved = check_state(
@@ -392,12 +398,12 @@ class Core:
             self._rewards.load_peaks_kw(saved.peaks_kw)
             self._begin_recording()
         except BaseException:
-            self._view = None  # half of it is the state before
+            self._view = None  # Old and new state are mixed, so the environments need a reset.
             raise
         return self._observe(self.view)
 
     def close(self) -> None:
-        """Release the simulator and all tables; the environments are unusable afterwards."""
+        """Release the simulator and all tables; the environments cannot be used afterwards."""
         if self._closed:
             return
         self._closed = True
@@ -427,7 +433,7 @@ class Core:
         return {a: {"features": features[a], "heat_map": image.copy()} for a in self.agents}
 
     def _drawn_start_days(self, drawn: I64) -> I64:
-        """First day of each episode from the options and a random number, (B,)."""
+        """Return the first day of each episode, by the options and random integers, (B,)."""
         if self.options.start == "fixed":
             starts = [c.site.start for c in self.sim.fleet.configs]
             return np.array([day_of_year(s) for s in starts], dtype=np.int64)
@@ -435,7 +441,7 @@ class Core:
 
 
 def _checked_size(num_envs: Any, configs: int) -> int:
-    """Number of environments, which is at least the number of configs."""
+    """Return the number of environments after a check that it is at least that of configs."""
     size = whole_number("num_envs", configs if num_envs is None else num_envs, 1, MOST_DCS)
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
@@ -446,8 +452,8 @@ def _check_others(options: EnvOptions, others: Controller) -> None:
     """Refuse a controller ``others`` that would have no effect.
 
     Raises:
-        ConfigError: a part of ``others`` is for a learning agent, or learning agents decide all
-            commands that ``others`` gives.
+        ConfigError: a part of ``others`` names a command of a learning agent, or learning agents
+            decide all commands that ``others`` sets.
     """
     if "others" not in options.model_fields_set:
         return

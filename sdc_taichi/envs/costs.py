@@ -1,10 +1,11 @@
 """Costs of a step for constrained learning: named quantities of at least 0.
 
 Costs are separate from rewards. Libraries for safe reinforcement learning keep the sum of
-``info["cost"]`` over an episode below a limit.
+``info["cost"]`` in each episode below a limit.
 
-A user's cost function takes the result of a step and the view after it. The option ``costs`` takes
-the function, the name under which ``register_cost`` registered it, or its import path.
+Users can write a cost function of the result of a step and the controller's view after the step.
+The option ``costs`` takes the function itself, its import path, or the name under which
+``register_cost`` registered it.
 """
 
 from __future__ import annotations
@@ -26,27 +27,27 @@ from sdc_taichi.user_functions import (
 )
 
 CostFunction = Callable[[StepResult, View], Any]
-"""Cost function of the result of a step and the view after it; returns values of at least 0,
-(B,)."""
+"""Cost function: takes the result of a step and the view after it, and returns one cost of at least
+0 per data center, (B,)."""
 
 
 def hot_inlets(result: StepResult, view: View) -> F64:
-    """Inlet temperature above the recommended 27 C, mean over servers, K h (ASHRAE TC 9.9)."""
+    """Excess of inlets over the recommended 27 C, mean of all servers, in K h (ASHRAE TC 9.9)."""
     return result.over_27_mean_k * result.step_h
 
 
 def throttled_racks(result: StepResult, view: View) -> F64:
-    """Racks that protection throttles or has switched off, rack h."""
+    """Racks that thermal protection throttles or has switched off, in rack hours."""
     return (result.throttled_racks + result.tripped_racks) * result.step_h
 
 
 def overdue_work(result: StepResult, view: View) -> F64:
-    """Work past its deadline in each step that it waits, and work dropped or lost, tasks."""
+    """Work past its deadline, counted in each step, and work dropped or lost, in tasks."""
     return result.overdue_tasks + result.dropped_tasks + result.lost_tasks
 
 
 def grid_overload(result: StepResult, view: View) -> F64:
-    """Energy drawn beyond the limit of the grid connection, kWh."""
+    """Energy drawn beyond the limit of the grid connection, in kWh."""
     return result.grid_overload_kwh
 
 
@@ -59,29 +60,30 @@ _registered: dict[str, CostFunction] = {}
 
 
 def register_cost(name: str, cost: CostFunction) -> None:
-    """Make a function available as a name in the option ``costs``.
+    """Register a cost function, so that the option ``costs`` accepts its name.
 
     Args:
-        name: an identifier that no other cost has.
-        cost: the function; see ``CostFunction``. It replaces an earlier function of the same module
-            and name, for example when a notebook cell runs again.
+        name: Python identifier that no other cost uses.
+        cost: the cost function; see ``CostFunction``. It replaces an earlier function of the same
+            module and name, for example when a notebook cell runs again.
 
     Raises:
-        ConfigError: the name belongs to another function, or ``cost`` is no function.
+        ConfigError: the name belongs to another function, or ``cost`` is not a function.
     """
     register_function("cost", name, cost, _registered, reserved=tuple(COSTS))
 
 
 class Costs:
-    """Costs of the option ``costs``.
+    """Computes the costs that the option ``costs`` selects.
 
     Args:
-        costs: names, functions or import paths, or a dict from them to weights; None for no costs.
+        costs: list of names, functions or import paths, or a dict from these to weights; None
+            selects no costs.
         fleet: the data centers.
 
     Raises:
-        ConfigError: an unknown name, one given twice, a weight that is not valid, or a cost that is
-            always 0.
+        ConfigError: a name is unknown or repeated, a weight is not valid, or a cost is always 0 in
+            this fleet.
     """
 
     def __init__(self, costs: Any, fleet: Fleet) -> None:
@@ -108,17 +110,17 @@ class Costs:
             )
 
     def of(self, result: StepResult, view: View) -> dict[str, F64]:
-        """Costs of a step: their weighted sum as ``cost``, each as ``cost_NAME``, (B,) each.
+        """Return each cost of a step as ``cost_NAME`` and their weighted sum as ``cost``.
 
         Args:
-            result: the step.
-            view: the view after it.
+            result: result of the step.
+            view: the controller's view after the step.
 
         Returns:
-            Costs by name; empty without the option ``costs``.
+            Costs by name, (B,) each; empty without the option ``costs``.
 
         Raises:
-            SdcError: a user's function returned values of another shape, not finite, or below 0.
+            SdcError: a user's function returned values of a wrong shape, not finite, or below 0.
         """
         if not self._functions:
             return {}
@@ -135,13 +137,13 @@ class Costs:
 
 
 def costs_markdown() -> str:
-    """The table of costs in docs/environments.md."""
+    """Return the Markdown table of costs for docs/environments.md."""
     rows = [f"| `{name}` | {function.__doc__} |" for name, function in COSTS.items()]
     return "\n".join(["| cost | of a step |", "|---|---|", *rows])
 
 
 def _with_weights(costs: Any) -> list[tuple[Any, Any]]:
-    """Costs and their weights; without weights each is 1."""
+    """Return pairs of cost and weight; each weight is 1 if the user named none."""
     if costs is None:
         return []
     if isinstance(costs, Mapping) and costs:
@@ -155,7 +157,7 @@ def _with_weights(costs: Any) -> list[tuple[Any, Any]]:
 
 
 def _named(cost: Any) -> tuple[str, CostFunction]:
-    """Name and function of a cost."""
+    """Return the name and the function of a cost."""
     if not callable(cost):
         function = function_named(
             "cost", cost, COSTS | _registered, valid=", ".join([*COSTS, *_registered])

@@ -1,4 +1,4 @@
-"""Seeds, first days, drawn inputs and saved states of episodes."""
+"""Random seeds, start days, randomly drawn inputs and saved states of episodes."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from sdc_taichi.sim.step_inputs import MOST_MOVES
 from sdc_taichi.types import F64, I64, State
 
 Seed = int | Sequence[int | None] | I64 | None
-"""Seed of environment 0, to which environment i adds i; or one for each environment, where None
-continues its present generator; or None for all."""
+"""Seed of B environments: an integer s gives environment i the seed s + i; a sequence gives one
+seed for each. None continues the random generator of an environment."""
 
 
 def seeded_generators(
     seed: Seed, present: Sequence[np.random.Generator], num_envs: int
 ) -> list[np.random.Generator]:
-    """A generator for each environment, by its seed or the present one.
+    """Return the random generator of each environment, newly seeded or continued.
 
     Args:
-        seed: environment i takes ``seed + i``, or entry i.
-        present: generators of the episode before; none before the first.
+        seed: environment i uses ``seed + i``, or entry i of a sequence; None continues.
+        present: generators of the previous episode; empty before the first episode.
         num_envs: number of environments.
 
     Raises:
-        ConfigError: a seed that is not valid, or another number of them than of environments.
+        ConfigError: a seed is not valid, or the number of seeds differs from ``num_envs``.
     """
     if seed is None and present:
         return list(present)
@@ -61,14 +61,15 @@ def seeded_generators(
 
 
 def chosen_start_days(given: Any, num_envs: int) -> I64:
-    """First day of each episode, counted from 0 in the year, (B,).
+    """Return the first day of each episode as day of the year, from 0, (B,).
 
     Args:
-        given: a day as ``MM-DD`` or counted from 0, or one for each environment.
-        num_envs: number of environments.
+        given: day as ``MM-DD`` or as number of the day in the year, from 0; or one day for each
+            environment.
+        num_envs: number of environments, B.
 
     Raises:
-        ConfigError: a day that is not valid, or another number of them than of environments.
+        ConfigError: a day is not valid, or the number of days is neither 1 nor ``num_envs``.
     """
     if isinstance(given, np.ndarray) and given.ndim == 0:
         given = given[()]
@@ -86,7 +87,7 @@ def _checked_seed(seed: Any) -> int:
 
 
 def _checked_day(day: Any) -> int:
-    """Day of the year, 0..364."""
+    """Return the number of a day in the year, 0..364, from a number or ``MM-DD``."""
     if isinstance(day, int | np.integer) and not isinstance(day, bool):
         if 0 <= day < DAYS_PER_YEAR:
             return int(day)
@@ -100,23 +101,24 @@ def _checked_day(day: Any) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Inputs of the episodes of B environments."""
+    """Randomly drawn inputs of the episodes of B environments."""
 
     years: tuple[int, ...] | None
-    """Seed of the synthetic series of each environment, B; None is ``site.seed``."""
+    """Seed of the synthetic series of each environment, B; None means ``site.seed``."""
     traces: tuple[str, ...] | None
-    """Workload trace of each environment, B; None is what the config names."""
+    """Workload trace of each environment, B; None means the trace of the config."""
 
 
 class DrawnInputs:
-    """Draws years and traces of episodes, and reads them.
+    """Draws the synthetic years and workload traces of episodes at random, and reads their data.
 
     Args:
         configs: config of each environment, B.
-        options: what episodes draw from.
+        options: environment options with the ``years`` and ``traces`` to draw from.
 
     Raises:
-        ConfigError: years of data centers without a synthetic series, or an unknown trace.
+        ConfigError: ``years`` is set but a data center has no synthetic series, or a trace is
+            unknown.
         DataError: the file of a trace is not valid.
     """
 
@@ -135,15 +137,15 @@ class DrawnInputs:
                     )
 
     def first(self) -> Drivers:
-        """Inputs that the configs name, by which devices are sized."""
+        """Return the inputs that the configs name; the simulator sizes devices for them."""
         return self._reader.read()
 
     def draw(self, generators: Sequence[np.random.Generator]) -> Draw:
-        """Year and trace of the next episodes.
+        """Draw the year and the trace of each environment's next episode.
 
         Args:
-            generators: that of each environment, of which the same numbers are drawn whatever the
-                options.
+            generators: random generator of each environment. Each gives the same count of random
+                numbers under all options, so options do not change later draws.
         """
         drawn = np.array([rng.integers(2**63 - 1, size=2) for rng in generators], dtype=np.int64)
         years = traces = None
@@ -156,16 +158,16 @@ class DrawnInputs:
         return Draw(years, traces)
 
     def drivers(self, draw: Draw) -> Drivers:
-        """Inputs of a draw; the same object while the draws are the same."""
+        """Return the input series of a draw, and the same object again for an equal next draw."""
         if self._last is None or self._last[0] != draw:
             self._last = draw, self._reader.read(draw.years, draw.traces)
         return self._last[1]
 
     def checked(self, given: Mapping[str, Any], num_envs: int) -> Draw:
-        """The draw that a saved state names.
+        """Return the draw that a saved state contains.
 
         Raises:
-            SdcError: a draw that these options cannot give.
+            SdcError: the options of these environments cannot give this draw.
         """
         years, traces = given["years"], given["traces"]
         valid_years = range(self._years) if isinstance(self._years, int) else self._years
@@ -185,12 +187,12 @@ class DrawnInputs:
 
 
 def draws_inputs(options: EnvOptions) -> bool:
-    """Whether episodes draw years or traces."""
+    """Return True if episodes draw their year or workload trace at random."""
     return options.years is not None or options.traces is not None
 
 
 def draw_info(draw: Draw | None) -> dict[str, Any]:
-    """Infos of a draw: ``year`` and ``trace``, (B,) each, as far as they are drawn."""
+    """Return the drawn inputs as infos: ``year`` and ``trace``, (B,) each, if they are drawn."""
     info: dict[str, I64 | np.ndarray[Any, Any]] = {}
     if draw is not None and draw.years is not None:
         info["year"] = np.array(draw.years, dtype=np.int64)
@@ -200,7 +202,7 @@ def draw_info(draw: Draw | None) -> dict[str, Any]:
 
 
 PARTS = ("options", "inputs", "simulator", "actions", "rewards", "generators", "keys")
-"""Entries of a state; all are plain values, arrays, or dicts and lists of them."""
+"""Keys of a saved state. Their values are plain values, arrays, or dicts and lists of these."""
 COMMAND_LIMITS = {
     "load": (-1.0, 1.0),
     "cooling": (-MOST_MOVES, MOST_MOVES),
@@ -208,28 +210,28 @@ COMMAND_LIMITS = {
     "placement": (1.0 / PLACEMENT_FACTOR, PLACEMENT_FACTOR),
     "battery": (-1.0, 1.0),
 }
-"""Lowest and highest command that an agent or a controller can give, by field of ``Actions``."""
+"""Minimum and maximum of each command of an agent or a controller, by field of ``Actions``."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavedState:
-    """Parts of a state of B environments with U CRAC units and R racks, checked."""
+    """Checked saved state of B environments with U CRAC units and R racks in total."""
 
     simulator: State
     """State of the simulator before the last step."""
     drivers: Drivers | None
-    """Inputs of the episodes; None if they draw none."""
+    """Input series of the episodes; None if episodes do not draw their inputs."""
     draw: Draw | None
-    """Years and traces of the episodes; None if they draw none."""
+    """Years and traces of the episodes; None if episodes do not draw their inputs."""
     generators: list[np.random.Generator]
-    """Generator of each environment, which draws its episodes."""
+    """Random generator of each environment."""
     keys: I64
-    """Seeds of the errors of forecasts, (B,)."""
+    """Seeds of the forecast errors, (B,)."""
     peaks_kw: F64
-    """Highest billed power before the last step and with it, in kW, (2, B)."""
+    """Highest billed power of the episode, before and after the last step, in kW, (2, B)."""
     commands: dict[str, F64] | None
     """Commands of the last step by field of ``Actions``, (), (B,), (U,) or (R,) each; None before
-    the first."""
+    the first step."""
 
 
 def check_state(
@@ -242,19 +244,19 @@ def check_state(
     by_others: Sequence[str],
     steps: int,
 ) -> SavedState:
-    """Check a state against the environments that will continue from it.
+    """Check a saved state against the environments that are to continue from it.
 
     Args:
-        values: what ``state_dict`` returned.
+        values: the saved state, as returned by ``state_dict``.
         options: plain values that identify the environments.
-        inputs: source of their years and traces; None if they draw none.
-        sim: their simulator.
-        learned: names of the commands of learning agents, which every step has.
-        by_others: names of the commands that ``others`` may give.
+        inputs: source of drawn years and traces; None if episodes do not draw their inputs.
+        sim: simulator of the environments.
+        learned: names of the commands of learning agents; every step sets all of them.
+        by_others: names of the commands that the controller ``others`` may set.
         steps: number of steps of an episode.
 
     Raises:
-        SdcError: made by other environments, incomplete, or not valid.
+        SdcError: the state belongs to other environments, is incomplete, or is not valid.
     """
     try:
         parts = {name: values[name] for name in PARTS}
@@ -289,7 +291,7 @@ def check_state(
 
 
 def _check_options(made: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
-    """Refuse a state that was made with other options."""
+    """Refuse a saved state of environments with other options."""
     for name, value in mine.items():
         if name not in made or made[name] != value:
             raise SdcError(
@@ -299,7 +301,7 @@ def _check_options(made: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
 
 
 def _generator(state: Any) -> np.random.Generator:
-    """The generator of an environment in a state that NumPy returned."""
+    """Return a random generator in a state that NumPy's ``bit_generator.state`` returned."""
     rng = np.random.Generator(np.random.PCG64(0))
     rng.bit_generator.state = state
     return rng
@@ -308,9 +310,10 @@ def _generator(state: Any) -> np.random.Generator:
 def _checked_commands(
     given: Mapping[str, Any] | None, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
 ) -> dict[str, F64] | None:
-    """Commands of the last step, (), (B,), (U,) or (R,) each; None before the first step.
+    """Check the saved commands of the last step, (), (B,), (U,) or (R,) each.
 
-    A controller may leave commands of CRAC units and racks at None.
+    None stands for a state before the first step. A controller may leave the commands ``cooling``
+    and ``placement`` at None; the saved state then lacks them.
     """
     if given is None:
         return None
@@ -342,7 +345,7 @@ def _checked(
     low: float,
     high: float,
 ) -> Any:
-    """Copy of an array of a state, which must have a type, one of some shapes, and a range."""
+    """Check type, shape and range of an array in a saved state, and return a copy."""
     array = as_array(f"state: {name}", given)
     if array.shape not in shapes or array.dtype != dtype:
         raise SdcError(

@@ -1,12 +1,13 @@
-"""Features: the named entries of observations, with ranges that no data and no result changes.
+"""Features: the named entries of observations, scaled by fixed ranges.
 
-A value v is scaled to ``(v - low) / (high - low)``, 0..1, or, where the range lies evenly about
-zero, to ``v / high``, -1..1. Values beyond the range are cut at it. Nothing looks ahead but the
-demand of the step to come and the forecasts.
+A value v is scaled to ``(v - low) / (high - low)``, 0..1. If the range is symmetric about zero, v
+is scaled to ``v / high``, -1..1. Values outside the range are clipped. Features contain no
+information about the future except forecasts and the demand of the coming step.
 
-Add a feature here: a function of ``TimeInputs``, of ``Measurements`` or, with an entry per rack, of
-the view. Its name is the name of the feature, its docstring the description in the documentation,
-and its decorator gives unit and range. Nothing else needs to know it.
+To add a feature, write a function in this module. Its argument is ``TimeInputs``, ``Measurements``
+or, for features with an entry per rack, the ``View``. The function's name is the name of the
+feature, its docstring is the description in the documentation, and its decorator sets unit and
+range. No other module needs a change.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ LONGEST_LEAD_H = float(HOURS_PER_YEAR)
 LeadH = Annotated[float, Field(gt=0, le=LONGEST_LEAD_H, allow_inf_nan=False)]
 """Lead of a forecast, above 0 and at most a year of 8,760 h."""
 AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
-"""Lower edges of the age bins in hours, those of the released code (``carbon_ls.py``); the last bin
-is open."""
+"""Lower edges of the age bins of queued work, in h, as in the released SustainDC code
+(``carbon_ls.py``). The last bin has no upper edge."""
 UNLIMITED_QUEUE_H = 10.0
-"""Hours of full work that count as a full queue where the queue has no limit."""
+"""Hours of work at full capacity that count as a full queue if the queue has no limit."""
 
 
 _Value = TypeVar("_Value", bound=Callable[..., Any])
@@ -49,44 +50,44 @@ _Value = TypeVar("_Value", bound=Callable[..., Any])
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A named entry of an observation, or several of one kind side by side."""
+    """A named quantity in an observation, with one or several adjacent entries."""
 
     name: str
-    """Name by which the option ``features`` chooses it."""
+    """Name of the feature in the option ``features``."""
     unit: str
     """Unit of the value before scaling."""
     low: float
-    """Lower end of the range, in ``unit``; lower values are cut at it."""
+    """Lower end of the range, in ``unit``; lower values are clipped to it."""
     high: float
-    """Upper end of the range, in ``unit``; higher values are cut at it."""
+    """Upper end of the range, in ``unit``; higher values are clipped to it."""
     description: str
-    """Meaning of the value, for the docs."""
+    """Meaning of the value, for the documentation."""
     size: int = 1
-    """Number of entries side by side."""
+    """Number of adjacent entries."""
     value: Callable[[Any], Any] = field(default=lambda _: (), compare=False, repr=False)
-    """Function of the inputs of its kind, ``TimeInputs``, ``Measurements`` or ``View``, that gives
-    the entries in ``unit``, (size, n) or a list of arrays (n,)."""
+    """Function that returns the entries in ``unit``, (size, n) or a list of arrays (n,). Its
+    argument is ``TimeInputs``, ``Measurements`` or ``View``, by the kind of the feature."""
 
     @property
     def signed(self) -> bool:
-        """Whether the range lies evenly about zero, so that values are scaled to -1..1."""
+        """True if the range is symmetric about zero, so that values are scaled to -1..1."""
         return self.low == -self.high
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Numbers on which the sizes of features depend."""
+    """Numbers of leads, CRAC units, fans and racks, which determine the sizes of features."""
 
     ci_leads_h: Sequence[float] = CI_LEADS_H
     """Leads of the forecasts of carbon intensity and price, in h."""
     weather_leads_h: Sequence[float] = WEATHER_LEADS_H
     """Leads of the weather forecasts, in h."""
     units: int = 1
-    """Number of CRAC units whose setpoints stand side by side."""
+    """Number of CRAC units with an observed setpoint each."""
     fans: int = 0
-    """Number of CRAC fans whose speeds agents decide; 0 if they decide none."""
+    """Number of CRAC fans whose speeds agents decide; 0 if agents do not control fans."""
     racks: int = 0
-    """Number of racks on which agents place work; 0 if they place none."""
+    """Number of racks on which agents place work; 0 if agents do not place work."""
 
 
 DEFAULT_LAYOUT = Layout()
@@ -95,66 +96,66 @@ DEFAULT_LAYOUT = Layout()
 
 @dataclass(frozen=True)
 class TimeInputs:
-    """Inputs of features that depend on time alone, for n steps of any data centers."""
+    """Inputs of features that depend on time alone, for n pairs of data center and step."""
 
     time_of_day: F32
-    """Sine and cosine of the local time, (2, n)."""
+    """Sine and cosine of the local time of day, (2, n)."""
     time_of_year: F32
-    """Sine and cosine of the share of the year, (2, n)."""
+    """Sine and cosine of the time of year, (2, n)."""
     ci: F32
-    """Carbon intensity at present and at each lead, in g/kWh, (1 + leads, n)."""
+    """Carbon intensity now and at each lead, in g/kWh, (1 + leads, n)."""
     outdoor_c: F32
-    """Dry bulb at present and at each lead, in C, (1 + leads, n)."""
+    """Dry bulb now and at each lead, in C, (1 + leads, n)."""
     wet_bulb_c: F32
-    """Wet bulb at present and at each lead, in C, (1 + leads, n)."""
+    """Wet bulb now and at each lead, in C, (1 + leads, n)."""
     price: F32
-    """Price relative to its mean at present and at each lead of ``ci``, (1 + leads, n)."""
+    """Price divided by its mean, now and at each lead of ``ci``, (1 + leads, n)."""
     workload: F32
-    """Work that arrives, as a share of capacity, (1, n)."""
+    """Work that arrives in the step, as a share of capacity, (1, n)."""
 
     @cached_property
     def lowest_ci(self) -> F32:
-        """Lowest carbon intensity of the present and the leads, in g/kWh, (n,)."""
+        """Minimum of the current and forecast carbon intensities, in g/kWh, (n,)."""
         return np.asarray(self.ci.min(axis=0))
 
     @cached_property
     def ci_swing(self) -> F32:
-        """Highest less lowest carbon intensity of present and leads, in g/kWh, (n,)."""
+        """Maximum minus minimum of current and forecast carbon intensities, in g/kWh, (n,)."""
         return np.asarray(self.ci.max(axis=0) - self.lowest_ci)
 
 
 class Design(NamedTuple):
-    """Reciprocals of the quantities to which measured features are relative, (B,) each.
+    """Reciprocals of design quantities, which make measured features relative, (B,) each.
 
-    They are 0 where the quantity is.
+    The reciprocal of a quantity that is 0 is set to 0.
     """
 
     per_full_queue: F64
-    """Share of a full queue per task."""
+    """Reciprocal of the size of a full queue, per task."""
     per_it_kwh: F64
     """Reciprocal of the IT energy of a step at the design point, per kWh."""
     per_hvac_kwh: F64
     """Reciprocal of the HVAC energy of a step at the design point, per kWh."""
     per_facility_kwh: F64
-    """Reciprocal of the energy of a step at the design point, per kWh."""
+    """Reciprocal of the facility energy of a step at the design point, per kWh."""
     per_battery_kwh: F64
-    """Reciprocal of the capacity of the battery, per kWh."""
+    """Reciprocal of the battery's capacity, per kWh."""
 
 
 class Measurements(NamedTuple):
     """Inputs of features that are measured in the data center, (B,) each.
 
-    Their functions are compiled: arithmetic, the NumPy functions of ``kernels/compiler/stage.py``,
-    and ``np.where`` in place of branches.
+    Functions of ``Measurements`` are compiled. They may use arithmetic, the NumPy functions of
+    ``kernels/compiler/stage.py``, and ``np.where`` in place of branches.
     """
 
     last: Any
-    """Result of the last step, of which any (B,) field of ``StepResult`` may be read; before the
-    first step temperatures are the setpoint and all else is 0."""
+    """Result of the last step with all (B,) fields of ``StepResult``. Before the first step all
+    temperatures equal the setpoint, and all other fields are 0."""
     waiting_tasks: F64
     """Tasks in the queue."""
     at_least_tasks: list[F64]
-    """Tasks in the queue that are at least as old as each of ``AGE_EDGES_H``."""
+    """Tasks in the queue that are at least as old as an age, for each age of ``AGE_EDGES_H``."""
     setpoints_c: list[F64]
     """Setpoint of each CRAC unit, in C."""
     fan_speeds: list[F64]
@@ -162,18 +163,18 @@ class Measurements(NamedTuple):
     stored_kwh: F64
     """Energy in the battery, in kWh."""
     design: Design
-    """Quantities of the design."""
+    """Reciprocals of design quantities."""
 
 
 FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
-"""Feature that an agent observes by default because it decides a command."""
+"""Additional default feature of an agent that decides a command, by command."""
 
 
 _Size = int | Callable[[Layout], int]
-"""Number of entries of a feature, or a function that returns it; there is no feature where it is
-0."""
+"""Number of entries of a feature, or a function that computes it from a ``Layout``. A feature of
+size 0 is left out."""
 _Kind = dict[str, tuple[Feature, _Size]]
-"""Features with the same kind of inputs, before their sizes are known, by name."""
+"""Features whose functions share one type of argument, by name, each with its declared size."""
 _TIME: _Kind = {}
 _MEASURED: _Kind = {}
 _OF_RACKS: _Kind = {}
@@ -182,14 +183,14 @@ _OF_RACKS: _Kind = {}
 def _feature(
     kind: _Kind, unit: str, low: float, high: float, size: _Size = 1
 ) -> Callable[[_Value], _Value]:
-    """Declare the feature of a function's name; its docstring describes it.
+    """Declare the decorated function as a feature with its name and its docstring as description.
 
     Args:
-        kind: features with the same kind of inputs.
+        kind: features of the same argument type, to which the new feature is added.
         unit: unit of the value.
-        low: lower end of the range.
-        high: upper end of the range.
-        size: number of entries.
+        low: lower end of the range, in ``unit``.
+        high: upper end of the range, in ``unit``.
+        size: number of entries, or a function that computes it from the layout.
     """
 
     def declare(function: _Value) -> _Value:
@@ -214,22 +215,22 @@ def _features_of(kind: _Kind, layout: Layout) -> tuple[Feature, ...]:
 
 
 def time_features(layout: Layout) -> tuple[Feature, ...]:
-    """Features that depend on time alone: functions of ``TimeInputs``."""
+    """Return the features that depend on time alone: functions of ``TimeInputs``."""
     return _features_of(_TIME, layout)
 
 
 def measured_features(layout: Layout) -> tuple[Feature, ...]:
-    """Features measured in the data center: functions of ``Measurements``."""
+    """Return the features that are measured in the data center: functions of ``Measurements``."""
     return _features_of(_MEASURED, layout)
 
 
 def rack_features(layout: Layout) -> tuple[Feature, ...]:
-    """Features with an entry per rack: functions of the view, which are not compiled."""
+    """Return the features with an entry per rack: functions of the view, not compiled."""
     return _features_of(_OF_RACKS, layout)
 
 
 def all_features(layout: Layout = DEFAULT_LAYOUT) -> tuple[Feature, ...]:
-    """All features in the order of the shared state."""
+    """Return all features in the order of the shared state."""
     return (*time_features(layout), *measured_features(layout), *rack_features(layout))
 
 
@@ -247,110 +248,110 @@ def _one_with_leads(layout: Layout) -> int:
 
 @_feature(_TIME, "1", -1.0, 1.0, 2)
 def time_of_day(t: TimeInputs) -> F32:
-    """Sine and cosine of the local time."""
+    """Sine and cosine of the local time of day."""
     return t.time_of_day
 
 
 @_feature(_TIME, "1", -1.0, 1.0, 2)
 def time_of_year(t: TimeInputs) -> F32:
-    """Sine and cosine of the share of the year."""
+    """Sine and cosine of the time of year."""
     return t.time_of_year
 
 
 @_feature(_TIME, "g/kWh", 0.0, 1000.0)
 def ci(t: TimeInputs) -> F32:
-    """Carbon intensity (CI) of the step to come."""
+    """Carbon intensity (CI) of the coming step."""
     return t.ci[:1]
 
 
 @_feature(_TIME, "g/kWh", 0.0, 1000.0, _ci_leads)
 def ci_forecast(t: TimeInputs) -> F32:
-    """CI in {ci_leads} h."""
+    """Forecast of the CI in {ci_leads} h."""
     return t.ci[1:]
 
 
 @_feature(_TIME, "g/kWh", -300.0, 300.0, _ci_leads)
 def ci_change(t: TimeInputs) -> F32:
-    """CI in {ci_leads} h less `ci`."""
+    """Forecast of the CI in {ci_leads} h, minus `ci`."""
     return np.asarray(t.ci[1:] - t.ci[:1])
 
 
 @_feature(_TIME, "share", 0.0, 1.0, _one_with_leads)
 def ci_rank(t: TimeInputs) -> F32:
-    """Share of the CI in {ci_leads} h that is below `ci`."""
+    """Share of the CI forecasts for {ci_leads} h that are below `ci`."""
     is_below = t.ci[1:] < t.ci[:1]
     return np.asarray(is_below.mean(axis=0, keepdims=True, dtype=np.float32))
 
 
 @_feature(_TIME, "share", 0.0, 1.0, lambda x: 1 + len(x.ci_leads_h) if x.ci_leads_h else 0)
 def ci_relative(t: TimeInputs) -> F32:
-    """`ci` and the CI in {ci_leads} h, between the lowest (0) and the highest (1) of them."""
+    """`ci` and the CI in {ci_leads} h, scaled from 0 at their minimum to 1 at their maximum."""
     return np.asarray((t.ci - t.lowest_ci) / np.where(t.ci_swing > 0, t.ci_swing, 1.0))
 
 
 @_feature(_TIME, "1", 0.0, 2.0, _one_with_leads)
 def ci_swing(t: TimeInputs) -> F32:
-    """Range of `ci` and the CI in {ci_leads} h, relative to `ci`."""
+    """Maximum minus minimum of `ci` and the CI in {ci_leads} h, relative to `ci`."""
     return np.asarray((t.ci_swing / np.where(t.ci[0] > 0, t.ci[0], 1.0))[None])
 
 
 @_feature(_TIME, "C", -30.0, 50.0)
 def outdoor(t: TimeInputs) -> F32:
-    """Dry bulb of the step to come."""
+    """Dry-bulb temperature of the coming step."""
     return t.outdoor_c[:1]
 
 
 @_feature(_TIME, "C", -30.0, 50.0, _weather_leads)
 def outdoor_forecast(t: TimeInputs) -> F32:
-    """Dry bulb in {weather_leads} h."""
+    """Forecast of the dry-bulb temperature in {weather_leads} h."""
     return t.outdoor_c[1:]
 
 
 @_feature(_TIME, "C", -30.0, 40.0)
 def wet_bulb(t: TimeInputs) -> F32:
-    """Wet bulb of the step to come."""
+    """Wet-bulb temperature of the coming step."""
     return t.wet_bulb_c[:1]
 
 
 @_feature(_TIME, "C", -30.0, 40.0, _weather_leads)
 def wet_bulb_forecast(t: TimeInputs) -> F32:
-    """Wet bulb in {weather_leads} h."""
+    """Forecast of the wet-bulb temperature in {weather_leads} h."""
     return t.wet_bulb_c[1:]
 
 
 @_feature(_TIME, "share", 0.0, 1.0)
 def workload(t: TimeInputs) -> F32:
-    """Work that arrives in the step to come."""
+    """Work that arrives in the coming step."""
     return t.workload
 
 
 @_feature(_TIME, "1", 0.0, 3.0)
 def price(t: TimeInputs) -> F32:
-    """Price of the step to come, relative to its mean."""
+    """Electricity price of the coming step, relative to its mean."""
     return t.price[:1]
 
 
 @_feature(_TIME, "1", 0.0, 3.0, _ci_leads)
 def price_forecast(t: TimeInputs) -> F32:
-    """Price in {ci_leads} h, relative to its mean."""
+    """Electricity price in {ci_leads} h, relative to its mean."""
     return t.price[1:]
 
 
 @_feature(_MEASURED, "share", 0.0, 1.0)
 def queue(m: Measurements) -> list[F64]:
-    """Queued work as a share of `workload.queue_limit_h`; without a limit, of 10 h of full work."""
+    """Queued work as a share of `workload.queue_limit_h`, or of 10 h of full load if unlimited."""
     return [m.waiting_tasks * m.design.per_full_queue]
 
 
 @_feature(_MEASURED, "h", 0.0, 24.0)
 def oldest_age(m: Measurements) -> list[F64]:
-    """Age of the oldest queued work."""
+    """Age of the oldest work in the queue."""
     return [m.last.oldest_age_h]
 
 
 @_feature(_MEASURED, "h", 0.0, 24.0)
 def mean_age(m: Measurements) -> list[F64]:
-    """Mean age of queued work."""
+    """Mean age of the work in the queue."""
     return [m.last.mean_age_h]
 
 
@@ -365,43 +366,43 @@ def age_histogram(m: Measurements) -> list[F64]:
 
 @_feature(_MEASURED, "C", 10.0, 60.0)
 def room(m: Measurements) -> list[F64]:
-    """Return air of the last step."""
+    """Return-air temperature in the last step."""
     return [m.last.return_c]
 
 
 @_feature(_MEASURED, "C", 10.0, 50.0)
 def hottest_inlet(m: Measurements) -> list[F64]:
-    """Hottest server inlet of the last step."""
+    """Temperature of the hottest server inlet in the last step."""
     return [m.last.inlet_max_c]
 
 
 @_feature(_MEASURED, "C", 10.0, 30.0, lambda x: x.units)
 def setpoint(m: Measurements) -> list[F64]:
-    """Supply setpoint of each CRAC unit; their mean where data centers differ in their number."""
+    """Supply-air setpoint of each CRAC unit; the mean if the fleet differs in numbers of units."""
     return m.setpoints_c
 
 
 @_feature(_MEASURED, "share", 0.0, 1.2)
 def it_energy(m: Measurements) -> list[F64]:
-    """IT energy of the last step, relative to that of a step at the design point."""
+    """IT energy of the last step, relative to the IT energy of a step at the design point."""
     return [m.last.it_kwh * m.design.per_it_kwh]
 
 
 @_feature(_MEASURED, "share", 0.0, 1.2)
 def hvac_energy(m: Measurements) -> list[F64]:
-    """HVAC energy of the last step, relative to that of a step at the design point."""
+    """HVAC energy of the last step, relative to the HVAC energy of a step at the design point."""
     return [m.last.hvac_kwh * m.design.per_hvac_kwh]
 
 
 @_feature(_MEASURED, "share", 0.0, 1.2)
 def dc_load(m: Measurements) -> list[F64]:
-    """Facility power of the last step, relative to that at the design point."""
+    """Facility power in the last step, relative to the facility power at the design point."""
     return [m.last.facility_kwh * m.design.per_facility_kwh]
 
 
 @_feature(_MEASURED, "share", 0.0, 1.0)
 def soc(m: Measurements) -> list[F64]:
-    """State of charge; 0 without a battery."""
+    """State of charge of the battery; 0 without a battery."""
     return [m.stored_kwh * m.design.per_battery_kwh]
 
 
@@ -413,7 +414,7 @@ def fan_speed(m: Measurements) -> list[F64]:
 
 @_feature(_OF_RACKS, "C", 10.0, 50.0, lambda x: x.racks)
 def rack_inlets(view: View) -> F64:
-    """Hottest inlet of each rack in the last step."""
+    """Hottest inlet temperature of each rack in the last step."""
     if view.last is None:
         return np.tile(mean_setpoint_c(view), (int(view.fleet.rack_offsets[1]), 1))
     return np.asarray(view.last.rack_inlet_max_c.reshape(view.size, -1).T)
@@ -424,17 +425,19 @@ def features_by_agent(
     known: Sequence[Feature],
     commands: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, tuple[Feature, ...]]:
-    """Features of every agent; an agent without an entry in ``chosen`` has its default features.
+    """Return the features that each agent observes.
 
-    By default, an agent also observes what the commands that it decides act on.
+    An agent without an entry in ``chosen`` observes its default features, and in addition the fan
+    speeds or rack inlets if it decides the command ``fan`` or ``placement``.
 
     Args:
-        chosen: names of features by agent; None leaves every agent its default features.
+        chosen: names of features by agent; None gives all agents their default features.
         known: all features.
-        commands: commands that agents decide, by agent; None is the default ones.
+        commands: commands that agents decide, by agent; None means the default commands.
 
     Raises:
-        ConfigError: an unknown agent or feature, a feature named twice, or no feature.
+        ConfigError: an agent or feature is unknown, a feature is named twice, or an agent has no
+            features.
     """
     chosen = chosen or {}
     for agent in chosen:
@@ -463,20 +466,20 @@ def features_by_agent(
 
 
 def features_space(features: Sequence[Feature]) -> Box:
-    """Space of an observation made of scaled ``features`` side by side, (n,)."""
+    """Return the space of an observation that concatenates scaled ``features``, (n,)."""
     low = np.concatenate([np.full(f.size, -1.0 if f.signed else 0.0) for f in features])
     return Box(low.astype(np.float32), np.ones(len(low), dtype=np.float32), dtype=np.float32)
 
 
 def scale(values: F32, feature: Feature) -> F32:
-    """Values in the unit of ``feature``, of any shape, scaled to its range and cut at it."""
+    """Scale values of a feature, of any shape, to 0..1 or -1..1, and clip them to its range."""
     if feature.signed:
         return np.asarray(np.clip(values / feature.high, -1.0, 1.0))
     return np.asarray(np.clip((values - feature.low) / (feature.high - feature.low), 0.0, 1.0))
 
 
 def feature_slices(features: Sequence[Feature]) -> dict[str, slice]:
-    """Entries of each feature, by name, where ``features`` stand side by side."""
+    """Return the slice of each feature, by name, in the concatenation of ``features``."""
     ends = np.cumsum([0, *(f.size for f in features)]).tolist()
     return {f.name: slice(first, first + f.size) for f, first in zip(features, ends, strict=False)}
 
@@ -484,18 +487,20 @@ def feature_slices(features: Sequence[Feature]) -> dict[str, slice]:
 def entries_of_new_features(
     features_of: Mapping[str, Sequence[Any]],
 ) -> dict[str, npt.NDArray[np.int64] | slice]:
-    """Entries of each agent's observation whose features no agent before it has.
+    """Return the indices in each agent's observation of features that no earlier agent observes.
+
+    The selected entries of all agents together contain each feature once.
 
     Args:
-        features_of: features of each agent, in the order of its observation; each has a ``size``,
-            and equal ones are one feature.
+        features_of: features of each agent, in the order of its observation. Each feature has a
+            ``size``, and equal objects count as the same feature.
     """
     known: set[Any] = set()
     out: dict[str, npt.NDArray[np.int64] | slice] = {}
     for agent, features in features_of.items():
         new = np.repeat([f not in known for f in features], [f.size for f in features])
         entries = np.flatnonzero(new)
-        # A slice needs no copy.
+        # Indexing with a slice copies nothing, unlike indexing with an array.
         contiguous = len(entries) > 0 and entries[-1] - entries[0] == len(entries) - 1
         out[agent] = slice(int(entries[0]), int(entries[-1]) + 1) if contiguous else entries
         known.update(features)
@@ -503,7 +508,7 @@ def entries_of_new_features(
 
 
 def features_markdown() -> str:
-    """The table of features in docs/observations.md, with a dot for agents' default features."""
+    """Return the Markdown table of features for docs/observations.md; dots mark the defaults."""
     lines = [
         "| feature | entries | what it is | unit | range | load | cooling | battery |",
         "|---|---|---|---|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""The racks of a hall as an image, an observation for convolutional networks."""
+"""Images of a hall: heat maps for convolutional networks, and rendered pictures of the racks."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ HEAT_MAP_CHANNELS = (
     Feature("rack_outlet", "C", 10.0, 70.0, "outlet of the rack"),
     Feature("rack_power", "share", 0.0, 2.0, "IT power over the hall's design power per rack"),
 )
-"""Channels of the heat map in order, all of the last step."""
+"""Channels of the heat map in order; all of them are results of the last step."""
 
 
 def heat_map(view: View) -> F32:
-    """Racks of the last step as images, 0..1, (B, rows, racks per row, channels).
+    """Return heat maps of the racks after the last step, 0..1, (B, rows, racks per row, channels).
 
-    The values are float rather than bytes, as 8 bits would leave steps of 0.16 K. Before the first
-    step all air has the temperature of the setpoint and no rack draws power.
+    The values are floats because 8-bit integers would resolve the inlets to 0.16 K only. Before the
+    first step all air is at the temperature of the setpoint and no rack draws power.
 
     Raises:
-        ConfigError: halls that differ in rows or racks per row.
+        ConfigError: the halls differ in their rows or racks per row.
     """
     shape = _shape_of_halls(view.fleet)
     racks = shape[0] * shape[1]
@@ -48,16 +48,16 @@ def heat_map(view: View) -> F32:
 
 
 def heat_map_space(fleet: Fleet) -> Box:
-    """Space of the heat map of one data center, (rows, racks per row, channels).
+    """Return the space of the heat map of one data center, (rows, racks per row, channels).
 
     Raises:
-        ConfigError: halls that differ in rows or racks per row.
+        ConfigError: the halls differ in their rows or racks per row.
     """
     return Box(0.0, 1.0, (*_shape_of_halls(fleet), len(HEAT_MAP_CHANNELS)), dtype=np.float32)
 
 
 def _shape_of_halls(fleet: Fleet) -> tuple[int, int]:
-    """Rows and racks per row that all halls of the fleet have."""
+    """Return the number of rows and of racks per row, which all halls of the fleet must share."""
     shapes = [(c.hall.rows, c.hall.racks_per_row) for c in fleet.configs]
     for config, shape in zip(fleet.configs, shapes, strict=True):
         if shape != shapes[0]:
@@ -70,45 +70,47 @@ def _shape_of_halls(fleet: Fleet) -> tuple[int, int]:
 
 
 Image = npt.NDArray[np.uint8]
-"""A picture, (height, width, 3), in red, green and blue of 0..255."""
+"""A picture, (height, width, 3), with red, green and blue of 0..255."""
 
 RENDER_MODES = ("rgb_array",)
-"""Valid values of ``render_mode`` beside None."""
+"""Valid values of ``render_mode`` besides None."""
 RANGE_C = (15.0, 35.0)
-"""Temperatures in C between which the colours run: from the coldest setpoint of the presets up to
-what class A2 allows (ASHRAE TC 9.9)."""
+"""Temperatures at both ends of the colour scale, in C: the lowest setpoint of the presets and the
+allowable limit of class A2 (ASHRAE TC 9.9)."""
 PX_PER_M = 40.0
-"""Scale of a picture, in pixels per metre, unless the hall is larger than ``LONGEST_PX``."""
+"""Scale of a picture, in pixels per metre; smaller if a side would exceed ``LONGEST_PX``."""
 LONGEST_PX = 1024
-"""Longest side of a picture in pixels; larger halls are drawn smaller, down to a pixel per rack."""
+"""Longest side of a picture, in pixels. Larger halls have a smaller scale, down to one pixel per
+rack; only then a side may be longer."""
 _SEPARATED_PX = 6.0
-"""Least width of a rack in pixels at which neighbours are drawn apart."""
+"""Minimum width of a rack, in pixels, for a gap between adjacent racks."""
 _FLOOR, _COLD, _HOT = (225, 225, 225), (198, 219, 239), (252, 205, 190)
 _INFERNO = (
     (0, 0, 4), (24, 12, 60), (66, 10, 104), (106, 23, 110), (147, 38, 103), (188, 55, 84),
     (221, 81, 58), (243, 118, 27), (252, 165, 10), (246, 215, 70), (252, 255, 164),
 )  # fmt: skip
-"""Every tenth of the inferno map (Smith and van der Walt 2015, CC0), perceptually uniform."""
+"""Eleven equally spaced colours of the perceptually uniform colour map "inferno" (Smith and van der
+Walt 2015, CC0)."""
 
 
 def check_render_mode(mode: str | None) -> None:
-    """Refuse a mode that does not exist.
+    """Refuse an unknown render mode.
 
     Raises:
-        ConfigError: neither None nor one of ``RENDER_MODES``.
+        ConfigError: ``mode`` is neither None nor one of ``RENDER_MODES``.
     """
     if mode is not None and mode not in RENDER_MODES:
         raise ConfigError(f"render_mode {mode!r}: valid is None or {', '.join(RENDER_MODES)}")
 
 
 def frame(view: View, env: int) -> Image:
-    """Picture of the hall of one environment after the last step, (height, width, 3).
+    """Draw the hall of one environment after the last step, (height, width, 3).
 
     Before the first step all inlets are at the mean setpoint.
 
     Args:
-        view: the view before the next step.
-        env: number of the environment in its batch.
+        view: the controller's view before the next step.
+        env: index of the environment in its batch.
     """
     fleet = view.fleet
     hall = fleet.configs[env].hall
@@ -121,14 +123,14 @@ def frame(view: View, env: int) -> Image:
 
 
 def hall_image(hall: HallConfig, inlet_c: npt.NDArray[np.float64]) -> Image:
-    """A plan of the hall with the racks coloured by their inlets.
+    """Draw the floor plan of a hall with racks coloured by their inlet temperatures.
 
     Args:
-        hall: racks and measures of the hall.
+        hall: racks and dimensions of the hall.
         inlet_c: inlet temperature of each rack, in C, (racks,).
 
     Returns:
-        (height, width, 3); the size depends on the hall alone.
+        The picture, (height, width, 3). Its size depends on the hall alone.
     """
     plan, measures = floor_plan(hall), hall.layout
     pitch_m, depth_m = measures.rack_pitch_m, measures.rack_depth_m
@@ -158,7 +160,7 @@ def hall_image(hall: HallConfig, inlet_c: npt.NDArray[np.float64]) -> Image:
 
 
 def colours(celsius: npt.NDArray[np.float64]) -> Image:
-    """Colours, (n, 3), of temperatures in C, (n,), which are cut at the ends of ``RANGE_C``."""
+    """Return the colours, (n, 3), of temperatures in C, (n,), clipped to ``RANGE_C``."""
     anchors = np.array(_INFERNO, dtype=np.float64)
     at_c = np.linspace(*RANGE_C, len(anchors))
     channels = [np.interp(celsius, at_c, anchor) for anchor in anchors.T]

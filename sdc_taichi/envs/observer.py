@@ -1,8 +1,9 @@
-"""Observations by named features, computed from the view of a controller.
+"""Observations of named features, computed from the view that controllers receive.
 
-A feature says how its value follows from its inputs (``features``). The observer computes each kind
-once for each view: entries that depend on time alone come from shared rows (``time_rows``), those
-measured in the data center from one compiled stage, and those of single racks from NumPy.
+Module ``features`` defines how a feature follows from its inputs. The observer computes all
+features once per view, by three methods. Entries that depend on time alone are copied from shared
+rows (``time_rows``). Entries measured in the data center come from one compiled stage. Entries of
+single racks are computed with NumPy.
 """
 
 from __future__ import annotations
@@ -41,27 +42,27 @@ from sdc_taichi.types import F32, F64, I64
 
 
 class Observer:
-    """Observations of each agent, and the shared state, of a fleet.
+    """Computes the observation of each agent, and the shared state, for a fleet.
 
-    Forecasts have the errors of the view.
+    Forecasts have the forecast errors of the view.
 
     Args:
-        fleet: the data centers.
-        agents: agents that observe.
-        features: names of the features of each agent; None is the default ones.
-        ci_leads_h: leads of the carbon-intensity forecast in h, rising multiples of the step.
-        weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
-        new_inputs: whether episodes may have other inputs than those before.
-        commands: commands that agents decide, by agent; None is the default ones.
+        fleet: the B data centers.
+        agents: names of the agents that observe.
+        features: names of the features of each agent; None means the default features.
+        ci_leads_h: leads of the carbon-intensity forecast, in h; increasing multiples of the step.
+        weather_leads_h: leads of the weather forecasts, in h; increasing multiples of the step.
+        new_inputs: True if inputs may differ from episode to episode.
+        commands: commands that agents decide, by agent; None means the default commands.
 
     Attributes:
         features: features of each agent, in the order of its observation.
-        spaces: space of each agent's observation.
+        spaces: observation space of each agent.
         state_features: all features, in the order of the shared state.
         state_space: space of the shared state.
 
     Raises:
-        ConfigError: an unknown agent or feature, or leads that are not valid.
+        ConfigError: an agent or feature is unknown, or a lead is not valid.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Observer:
             agent: np.concatenate([entries[slices[f.name]] for f in self.features[agent]])
             for agent in agents
         }
-        # Places of other entries take any time entry and are written over afterwards.
+        # Measured entries first receive an arbitrary time entry, which ``observe`` overwrites.
         from_rows = {a: np.where(c < self._time_width, c, 0) for a, c in columns.items()}
         self._runs = {agent: _runs(c - self._time_width) for agent, c in columns.items()}
         self._time = TimeRows(
@@ -131,7 +132,10 @@ class Observer:
         self._entries = None
 
     def observe(self, view: View) -> dict[str, F32]:
-        """Observation of each agent before the step to come, (B, n) each; after ``reset``."""
+        """Return the observation of each agent before the coming step, (B, n) each.
+
+        ``reset`` must have been called.
+        """
         entries = self._entries_of(view)
         observations: dict[str, F32] = {}
         for agent, runs in self._runs.items():
@@ -141,10 +145,10 @@ class Observer:
         return observations
 
     def state(self, view: View) -> F32:
-        """Shared state: all features side by side, (B, m).
+        """Return the shared state, which concatenates all features, (B, m).
 
         Raises:
-            RuntimeStateError: before ``reset``.
+            RuntimeStateError: ``reset`` has not been called.
         """
         entries, width = self._entries_of(view), self._time_width
         out = np.empty((view.size, width + len(entries.measured)), dtype=np.float32)
@@ -153,13 +157,13 @@ class Observer:
         return out
 
     def _entries_of(self, view: View) -> _Entries:
-        """Entries of all features in a view, computed once for each view."""
+        """Return the entries of all features in a view, from a cache if the view is the same."""
         if self._entries is None or self._entries.view is not view:
             self._entries = _Entries(view, *self._time.rows(view), self._measure(view))
         return self._entries
 
     def _measure(self, view: View) -> F32:
-        """Scaled entries that do not depend on time alone, (m, B), one contiguous row each."""
+        """Compute the scaled entries measured in the data center, (m, B), a contiguous row each."""
         state, layout = view.state, self._layout
         setpoints = (
             state.setpoint_c.reshape(-1, layout.units).T
@@ -180,7 +184,7 @@ class Observer:
         return np.concatenate([measured, *of_racks])
 
     def _compile(self, view: View) -> None:
-        """Compile the stage from the inputs in ``_measure`` to scaled entries in order."""
+        """Compile the stage that maps the inputs from ``_measure`` to scaled entries."""
         from sdc_taichi.kernels.compiler.stage import CompiledStage
 
         oldest = view.state.queue.shape[1] - 1
@@ -213,19 +217,22 @@ class _Entries(NamedTuple):
     """Scaled entries of all features in one view."""
 
     view: View
-    """The view that was observed."""
+    """View to which the entries belong."""
     time: F32
-    """Rows of time entries, which data centers share, (rows, width)."""
+    """Rows of entries that depend on time alone, shared by data centers, (rows, width)."""
     arranged: dict[str, F32]
-    """The same rows arranged for the observation of each agent, (rows, n)."""
+    """The same rows in the order of each agent's observation, (rows, n)."""
     row_numbers: I64
-    """Row of each data center, (B,)."""
+    """Index into ``time`` of the row of each data center, (B,)."""
     measured: F32
-    """All other entries, (m, B)."""
+    """Entries that do not depend on time alone, (m, B)."""
 
 
 class _AtRest:
-    """Stands in for the result of a step before the first: air at the setpoint, and all else 0."""
+    """Substitute for the result of a step before the first step.
+
+    Its temperatures equal the mean setpoint; all other quantities are 0.
+    """
 
     def __init__(self, view: View) -> None:
         self._air_c, self._zero = mean_setpoint_c(view), np.zeros(view.size)
@@ -237,15 +244,15 @@ class _AtRest:
 def make_observer(
     fleet: Fleet, options: EnvOptions, *, new_inputs: bool = False
 ) -> Observer | ReleasedObserver:
-    """The observer of the agents that learn.
+    """Create the observer of the agents that learn.
 
     Args:
         fleet: the data centers.
-        options: observations and leads.
-        new_inputs: whether episodes may have other inputs than those before.
+        options: environment options, among them features and leads.
+        new_inputs: True if inputs may differ from episode to episode.
 
     Raises:
-        ConfigError: features or leads that do not fit the data centers.
+        ConfigError: features or leads do not fit the data centers.
     """
     if options.observations == "sustaindc":
         return ReleasedObserver(options.agents)
@@ -261,14 +268,14 @@ def make_observer(
 
 
 def _runs(sources: I64) -> list[tuple[slice, slice]]:
-    """Neighbours in an observation that are neighbours in their source too, copied together.
+    """Find runs of observation entries whose sources are contiguous too, to copy each at once.
 
     Args:
-        sources: measured entry from which each entry of an observation comes, (n,); below 0 it
-            comes from a time row.
+        sources: for each entry of an observation, the index of the measured entry to copy, (n,); a
+            negative index marks an entry from a time row.
 
     Returns:
-        Places in the observation and in the measured entries.
+        Pairs of slices: of the observation, and of the measured entries.
     """
     breaks = np.diff(sources, prepend=-(2**31)) != 1
     starts = np.flatnonzero(breaks | (sources == 0)).tolist()
@@ -280,7 +287,7 @@ def _runs(sources: I64) -> list[tuple[slice, slice]]:
 
 
 def _design(sizing: Sizing, step_h: float, per_full_queue: F64) -> Design:
-    """Reciprocals of the quantities to which measured features are relative."""
+    """Compute the reciprocals of the design quantities that make measured features relative."""
     kwh = step_h / 1e3
     return Design(
         per_full_queue=per_full_queue,
@@ -292,5 +299,5 @@ def _design(sizing: Sizing, step_h: float, per_full_queue: F64) -> Design:
 
 
 def _inverse(values: F64) -> F64:
-    """Reciprocals of values, and 0 where they are 0, of the same shape."""
+    """Return the reciprocals of positive values and 0 for all others, in the same shape."""
     return np.where(values > 0, 1.0 / np.where(values > 0, values, 1.0), 0.0)

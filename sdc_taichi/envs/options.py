@@ -39,18 +39,19 @@ from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 
 def _plain_int(value: Any) -> Any:
-    """Python integers in place of NumPy integers."""
+    """Convert NumPy integers to Python integers; return all other values unchanged."""
     return int(value) if isinstance(value, np.integer) else value
 
 
 PLAIN_INT = BeforeValidator(_plain_int)
-"""Accepts NumPy integers in fields with ``strict=True``, which refuse floats and booleans."""
+"""Pydantic validator that accepts NumPy integers in fields with ``strict=True``. Such fields still
+refuse floats and booleans."""
 Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 """A month, 1..12."""
 MOST_YEARS = 2**31
-"""Largest number of years to draw from."""
+"""Maximum number of years from which episodes draw."""
 MOST_LISTED_YEARS = 100_000
-"""Largest number of years in a range, which becomes a list."""
+"""Maximum length of a ``range`` of years, which is converted to a list."""
 Year = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), PLAIN_INT]
 """Seed of a synthetic year, 0..2**63 - 1."""
 YearCount = Annotated[int, Field(strict=True, ge=1, le=MOST_YEARS), PLAIN_INT]
@@ -63,67 +64,75 @@ class EnvOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
-    """Agents that learn; controller ``others`` commands the rest."""
+    """Agents that learn. The controller ``others`` commands all other agents."""
     others: Any = "idle"
-    """Controller of the agents that do not learn: a name as on the command line, or
-    ``load=name,cooling=name,battery=name`` in part, or an object with ``reset(seed)`` and
-    ``act(view)``, of which each environment has a copy."""
+    """Controller of the agents that do not learn. Valid are a name as on the command line, a list
+    of parts such as ``load=name,cooling=name,battery=name``, or an object with the methods
+    ``reset(seed)`` and ``act(view)``. Each environment uses its own copy of the object."""
     actions: Literal["discrete", "continuous"] = "discrete"
-    """Whether an agent chooses one of three commands or a number."""
+    """Kind of actions: ``discrete`` chooses among three commands, ``continuous`` is a number of
+    -1..1."""
     action_order: Literal["paper", "sustaindc"] | None = None
-    """Order of the battery's discrete actions: charge, hold, discharge as in the paper, or charge,
-    discharge, hold as in the released code; None is that of the preset."""
+    """Order of the battery's discrete actions 0, 1 and 2: ``paper`` means charge, hold, discharge;
+    ``sustaindc`` means charge, discharge, hold, as in the released code. None chooses the order of
+    the preset."""
     commands: Mapping[str, tuple[str, ...]] | None = None
-    """Commands that agents decide, in the order in which they stand in the action, by agent: of
-    agent_ls ``load`` and ``placement``, of agent_dc ``cooling``, ``fan`` and ``placement``; agents
-    left out decide ``load``, ``cooling`` and ``battery``."""
+    """Commands that agents decide, by agent, in the order of the numbers in the action. agent_ls
+    can decide ``load`` and ``placement``; agent_dc ``cooling``, ``fan`` and ``placement``;
+    agent_bat ``battery``. Agents that are left out decide ``load``, ``cooling`` and ``battery``,
+    respectively."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
-    """Change of the setpoint in one step by a continuous action of 1, the largest, in K."""
+    """Change of the setpoint in one step at a continuous action of 1, in K. This is the largest
+    change."""
     fan_change: Annotated[float, Field(ge=0.001, le=1)] = 0.2
-    """Change of the CRAC fan speed over full speed in one step by a continuous action of 1, the
-    largest, 0.001..1; fans hold no smaller steps, and the whole range is 1."""
+    """Change of the CRAC fan speed in one step at a continuous action of 1, as a share of full
+    speed, 0.001..1. This is the largest change."""
     days: Annotated[int, Field(strict=True, ge=1, le=365), PLAIN_INT] = 7
     """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"
-    """Whether episodes start at midnight of a day drawn from ``months``, or on ``site.start``."""
+    """Start of episodes: ``sampled`` means midnight of a random day in ``months``, ``fixed`` means
+    midnight of the day ``site.start``."""
     months: tuple[Month, ...] = tuple(range(1, 13))
-    """Months, 1..12, that sampled episodes lie in from start to end."""
+    """Months, 1..12, of sampled episodes. All days of an episode are in these months."""
     years: YearCount | tuple[Year, ...] | None = None
-    """Years that episodes are drawn from, as seeds of the synthetic series in place of
-    ``site.seed``: a number n for the seeds 0 to n - 1, or a list of seeds; None is ``site.seed``
-    alone."""
+    """Years from which each episode draws one at random. A year is a seed of the synthetic series
+    and replaces ``site.seed``. A number n means the seeds 0 to n - 1, a list names the seeds, and
+    None means ``site.seed`` in all episodes."""
     traces: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
-    """Workload traces that episodes are drawn from, names or files, in place of
-    ``workload.trace``; None is that alone."""
+    """Workload traces, by name or file, from which each episode draws one at random. None means
+    ``workload.trace`` in all episodes."""
     observations: Literal["default", "sustaindc"] = "default"
-    """Whether agents observe named features or the vectors of the released code."""
+    """Kind of observations: ``default`` means named features, ``sustaindc`` means the observation
+    vectors of the released SustainDC code."""
     features: Mapping[str, tuple[str, ...]] | None = None
-    """Names of the features that agents observe, by agent; agents left out have the default."""
+    """Names of the features that agents observe, by agent. Agents that are left out observe their
+    default features."""
     ci_leads_h: tuple[LeadH, ...] = CI_LEADS_H
     """Leads of the carbon-intensity forecast, in h."""
     weather_leads_h: tuple[LeadH, ...] = WEATHER_LEADS_H
     """Leads of the weather forecasts, in h."""
     forecast_error: ForecastError = PERFECT
-    """How forecasts err."""
+    """Errors of the forecasts of carbon intensity and weather."""
     heat_map: bool = False
-    """Whether every observation becomes a dict of features and an image of the hall."""
+    """True if every observation is a dict of features and an image of the hall."""
     rewards: Any = "default"
-    """Rewards: ``default``, ``bill``, ``paper``, ``sustaindc``, agent to term to scale, or a
-    function, the name that ``register_reward`` gave it, or its import path ``module:name``."""
+    """Rewards of the agents. Valid are the reward sets ``default``, ``bill``, ``paper`` and
+    ``sustaindc``; a dict of agent to term to scale; or a function, by the object, by its registered
+    name (``register_reward``) or by its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
-    """Weight a of an agent's individual reward in the reward it receives, 0..1; the individual
-    rewards of the other two agents have the weight (1 - a)/2 each (paper, section 4.5). 1 is no
-    collaboration."""
+    """Weight a, 0..1, of an agent's individual reward in the reward that the agent receives. The
+    individual rewards of the other two agents have the weight (1 - a)/2 each (paper, section 4.5).
+    1 means no collaboration."""
     tariff: TariffConfig | None = None
-    """Prices of electricity in place of those of the configs; None keeps them."""
+    """Electricity tariff that replaces the tariff of all configs; None keeps theirs."""
     costs: Any = None
     """Costs of each step for ``info["cost"]``: a list of names, functions or import paths
-    ``module:name``, or a dict of them to weights; None is none."""
+    ``module:name``, or a dict from these to weights. None means no costs."""
 
     @field_validator("years", "traces", mode="before")
     @classmethod
     def _plain_list(cls, value: Any) -> Any:
-        """Ranges and paths as lists of numbers and text."""
+        """Convert ranges, lists and tuples to lists of numbers and text."""
         if isinstance(value, range):
             if len(value) > MOST_LISTED_YEARS:
                 raise ValueError(f"{value}; valid is a range of at most {MOST_LISTED_YEARS:,}")
@@ -187,7 +196,7 @@ class EnvOptions(BaseModel):
         return self
 
     def _without_effect(self) -> list[tuple[tuple[str, ...], bool, str]]:
-        """Names of options, whether they have no effect here, and the reason."""
+        """List conditions of options without effect: names, True if it applies, and the reason."""
         continuous = self.actions == "continuous"
         shared = isinstance(self.rewards, Mapping) or (
             isinstance(self.rewards, str) and self.rewards in REWARD_SETS
@@ -234,13 +243,14 @@ class EnvOptions(BaseModel):
         ]
 
     def commands_of(self, agent: str) -> tuple[str, ...]:
-        """Commands that an agent decides if it learns, in the order of its action."""
+        """Return the commands that an agent decides if it learns, in the order of its action."""
         return (self.commands or {}).get(agent, (AGENT_DEFINITIONS[agent].command,))
 
     def start_days(self) -> list[int]:
-        """Days of the year, from 0, on which a sampled episode may start.
+        """Return the days of the year, from 0, on which a sampled episode may start.
 
-        All year round, episodes may run past 31 December, where the inputs repeat.
+        If ``months`` contains all months, episodes may continue past 31 December; the inputs then
+        repeat from 1 January.
         """
         if len(self.months) == 12:
             return list(range(DAYS_PER_YEAR))
@@ -250,25 +260,30 @@ class EnvOptions(BaseModel):
 
 
 def fields_set(options: EnvOptions) -> dict[str, Any]:
-    """Options that were set, by name; the others may be errors where they have no effect."""
+    """Return the options that were set explicitly, by name.
+
+    Options at their defaults are left out, because setting an option without effect is an error.
+    """
     return {name: getattr(options, name) for name in options.model_fields_set}
 
 
 def make_options(**values: Any) -> EnvOptions:
-    """Options by keyword.
+    """Create environment options from keywords.
 
     Raises:
-        ConfigError: an unknown option or a value that is not valid.
+        ConfigError: an option is unknown, or a value is not valid.
     """
     return validated(EnvOptions, values, "environment")
 
 
 OneConfig: TypeAlias = DataCenterConfig | Mapping[str, Any]
-"""A config, or its sections as plain values."""
+"""A config, or a dict of its sections as plain values."""
 ConfigSource: TypeAlias = str | os.PathLike[str] | OneConfig | Sequence[OneConfig]
-"""A preset, a file, a config or its sections, or for batches several of the latter."""
+"""Name of a preset, a file, a config or a dict of its sections; for batches also a sequence of
+configs or dicts."""
 Overrides: TypeAlias = Mapping[str, Any] | Sequence[str]
-"""Values put into the config: section.key to value, or a list of ``section.key=value``."""
+"""Values that replace those of the config: a dict of section.key to value, or a list of
+``section.key=value``."""
 
 
 def configs_and_options(
@@ -278,17 +293,17 @@ def configs_and_options(
     keywords: Mapping[str, Any],
     only_agent: str | None = None,
 ) -> tuple[list[DataCenterConfig], EnvOptions]:
-    """Configs and options from the arguments of an entry point.
+    """Return configs and options from the arguments of an environment's constructor.
 
     Args:
         config: a preset, a file, a config, or several configs.
-        overrides: values put into every config.
-        options: options; None is the default ones.
+        overrides: values that replace those of every config.
+        options: options of the environment; None means the default options.
         keywords: fields of ``EnvOptions``, which take precedence over ``options``.
-        only_agent: the one agent that learns, if the entry point has a single one.
+        only_agent: the learning agent of an environment with a single agent; None otherwise.
 
     Raises:
-        ConfigError: a config, override or option that is not valid.
+        ConfigError: a config, override or option is not valid.
     """
     configs = _configs(config, _checked_overrides(overrides))
     return configs, _options(options, keywords, only_agent)
@@ -298,7 +313,7 @@ def _configs(source: Any, overrides: Overrides) -> list[DataCenterConfig]:
     if isinstance(source, str | os.PathLike):
         if isinstance(overrides, Mapping):
             return [_with_overrides(load_config(source), overrides)]
-        # A file can be valid with its overrides only.
+        # Overrides are applied before validation: some files are valid only with their overrides.
         return [load_config(source, list(overrides))]
     listed: list[Any] = list(source) if isinstance(source, Sequence) else [source]
     if not listed:

@@ -23,19 +23,20 @@ from sdc_taichi.envs.options import ConfigSource
 
 
 class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
-    """A PettingZoo environment: the learning agents of one data center act at the same time.
+    """PettingZoo environment in which the learning agents of one data center act at the same time.
 
-    Episodes end by truncation, as their length is a choice and the data center runs on. All agents
-    have the same infos: after ``reset`` ``start_day`` and drawn inputs, after a step every (B,)
-    quantity of ``StepResult`` by name and the costs of the option ``costs``.
+    Episodes end by truncation, because their length is a choice and a data center has no final
+    state. All agents have the same infos. Infos of ``reset`` are ``start_day`` and the randomly
+    drawn inputs. Infos of a step are the facility's quantities of ``StepResult`` by name, and the
+    costs of the option ``costs``.
 
     Args:
         config: a preset, a file or a config.
         arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
-            fields of ``EnvOptions``, as docs/environments.md lists them.
+            fields of ``EnvOptions``; see docs/environments.md.
 
     Raises:
-        SdcError: a config or option that is not valid.
+        SdcError: a config or option is not valid.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  as the base class has it
@@ -57,11 +58,12 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """Start an episode.
 
         Args:
-            seed: seed of all randomness from here on; None continues the present generator.
-            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0.
+            seed: seed of the random generator; None continues the current generator.
+            options: dict with ``start_day``, a day as ``MM-DD`` or as number of the day in the
+                year, from 0.
 
         Raises:
-            ConfigError: a seed or day that is not valid.
+            ConfigError: the seed or the day is not valid.
         """
         observations = self.core.reset(seed, start_day_option(options, strict=False))
         self.agents = list(self.possible_agents)
@@ -77,14 +79,15 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Advance by one step.
+        """Advance the data center by one step.
 
         Args:
-            actions: one per learning agent.
+            actions: one action per learning agent, by agent.
 
         Raises:
-            SdcError: actions that are missing, too many, or outside their space.
-            RuntimeStateError: before ``reset``, or after the end of the episode.
+            SdcError: the action of an agent is missing or outside its space, or there is an action
+                of an agent that does not learn.
+            RuntimeStateError: the environment has not been reset, or the episode is over.
         """
         if isinstance(actions, Mapping):
             actions = {agent: [action] for agent, action in actions.items()}
@@ -118,18 +121,18 @@ parallel_env = SdcParallelEnv
 
 
 def aec_env(config: ConfigSource = "corrected", **arguments: Any) -> AECEnv[str, Observation, Any]:
-    """A PettingZoo environment whose agents act in turn, by PettingZoo's own conversion.
+    """Create a PettingZoo environment whose agents act in turn, with PettingZoo's own conversion.
 
     Args:
         config: a preset, a file or a config.
-        arguments: the same as those of ``parallel_env``.
+        arguments: arguments of ``parallel_env``.
 
     Raises:
-        SdcError: a config or option that is not valid.
+        SdcError: a config or option is not valid.
     """
     return parallel_to_aec(parallel_env(config, **arguments))
 
 
 def _first_of_each(observations: Mapping[str, Observation]) -> dict[str, Observation]:
-    """Observations of a batch of one by agent, (n,) each."""
+    """Return the observations of the only environment of a batch by agent, (n,) each."""
     return {agent: first_of_batch(values) for agent, values in observations.items()}

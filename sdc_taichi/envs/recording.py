@@ -1,10 +1,10 @@
-"""Recordings of chosen episodes of environments.
+"""Recordings of selected episodes of environments.
 
-Option ``recorder`` of all environments takes an ``EpisodeRecorder``, the choice of episodes and
-their destination; wrapper ``RecordEpisodes`` does the same for vector environments. A ``Recorder``
-(sdc_taichi.viz.recorder) writes each episode. ``Core`` passes it every step of the batch, so
-recordings do not depend on the interface of the environment, and results do not depend on whether
-they are recorded.
+The argument ``recorder`` of all environments takes an ``EpisodeRecorder``, which selects episodes
+and names the destination. The wrapper ``RecordEpisodes`` does the same for vector environments. A
+``Recorder`` (sdc_taichi.viz.recorder) writes each episode. ``Core`` passes every step of the batch
+to the recorder, so recordings are the same for all interfaces of an environment. Recording does
+not change the results of an episode.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def capped_cubic_schedule(episode: int) -> bool:
-    """Whether an episode is recorded by default: 0, 1, 8, 27, ..., 1000, 2000, 3000, ...
+    """Return True for the episodes recorded by default: 0, 1, 8, 27, ..., 1000, 2000, 3000, ...
 
     Gymnasium's ``RecordVideo`` has the same default.
     """
@@ -39,39 +39,39 @@ def capped_cubic_schedule(episode: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecorder:
-    """Choice of the recorded episodes and environments, and their destination."""
+    """Selects the episodes and environments to record, and names the destination."""
 
     target: str | os.PathLike[str] | Recorder
-    """Destination of the recordings.
+    """Destination of the recordings: a path, the address of a viewer, or a ``Recorder``.
 
-    Either a path ending in .rrd, to whose name each file adds the number of its episode
-    (``run-episode-8.rrd`` for ``run.rrd``); the address of a viewer; or a ``Recorder``, which
-    numbers its own files.
+    A path ends in .rrd. Each file adds the number of its episode to the name, such as
+    ``run-episode-8.rrd`` for ``run.rrd``. A ``Recorder`` numbers its own files.
     """
     episode_trigger: Callable[[int], bool] | None = None
-    """Function of the episode's number, from 0, that decides whether to record it; None is
+    """Function of an episode's number, from 0, that returns True to record the episode; None means
     ``capped_cubic_schedule``."""
     envs: Sequence[int] | None = None
-    """Indices of up to 4 environments of a batch, recorded together; None is the first, or the
-    focus of a given ``Recorder``."""
+    """Indices of up to 4 environments of a batch, recorded together. None records the first
+    environment, or the environments that a ``Recorder`` as target focuses on."""
     every: int | None = None
-    """Steps between two heat maps, and between two frames of the 3D hall; None chooses by the
-    number of recorded racks."""
+    """Number of steps between two heat maps, and between two frames of the 3D hall. None chooses
+    the number by the number of recorded racks."""
 
 
 RecorderOption: TypeAlias = "str | os.PathLike[str] | Recorder | EpisodeRecorder | None"
-"""Argument ``recorder`` of environments: an ``EpisodeRecorder``, or the target of one."""
+"""Type of the argument ``recorder`` of environments: an ``EpisodeRecorder``, the target of one, or
+None for no recordings."""
 
 
 class EpisodeRecordings:
-    """Successive recordings of a batch's episodes.
+    """Records the selected episodes of a batch, one after the other.
 
     Args:
-        recorder: chosen episodes and destination, or a destination.
+        recorder: selected episodes and destination, or only a destination.
         sim: the simulator of the batch.
 
     Raises:
-        SdcError: a recorder that is not valid.
+        SdcError: the recorder is not valid.
     """
 
     def __init__(
@@ -86,18 +86,18 @@ class EpisodeRecordings:
         self._close_recorder: Any = None
         self._recorder: Recorder | None = None
         self._place: Path | Recorder | None = None
-        self._make_recorder(0)  # reports an invalid target before any episode
+        self._make_recorder(0)  # An invalid target must fail here, before any episode.
 
     @property
     def is_recording(self) -> bool:
-        """Whether the present episode is recorded."""
+        """True if the current episode is recorded."""
         return self._recorder is not None
 
     def begin(self, sim: Simulator) -> None:
-        """End the previous recording, and begin one of the new episode if it is chosen.
+        """End the previous recording, and start one of the new episode if it is selected.
 
-        If the recording of a later episode cannot be opened, the episode continues without it after
-        a ``RecordingWarning``.
+        If the recording cannot be opened, the first episode fails. A later episode continues
+        without a recording after a ``RecordingWarning``.
 
         Args:
             sim: the simulator of the batch.
@@ -119,22 +119,22 @@ class EpisodeRecordings:
             self._warn_without_recording(error)
             return
         self._recorder = recorder
-        # Complete the file at exit if nothing closes the environment. Exit functions run last in,
-        # first out, so this one precedes those that Rerun registered at its import. Rerun imports
-        # concurrent.futures.thread only when it needs it, which at exit would be too late.
+        # Complete the file at exit if the user does not close the environment. Exit functions run
+        # in reverse order of registration, so this one runs before those that Rerun registered at
+        # its import. Rerun imports concurrent.futures.thread lazily, which fails during exit.
         importlib.import_module("concurrent.futures.thread")
         self._close_recorder = weakref.finalize(self, recorder.close)
         atexit.register(self._close_recorder)
 
     def add(self, result: StepResult, rewards: Mapping[str, F64]) -> None:
-        """Record a step of the present episode, which has a recording.
+        """Record a step of the current episode, whose recording must be in progress.
 
-        If an earlier step is missing after an error of a reward function, the episode continues
-        without its recording after a ``RecordingWarning``.
+        An error in a user's reward function can leave a step unrecorded. The next call then ends
+        the recording with a ``RecordingWarning``, and the episode continues without it.
 
         Args:
             result: the result of the step.
-            rewards: rewards and their terms by name, (B,) each.
+            rewards: rewards and reward terms by name, (B,) each.
         """
         assert self._recorder is not None
         try:
@@ -144,7 +144,7 @@ class EpisodeRecordings:
             self.end()
 
     def end(self) -> None:
-        """End the recording of the present episode, if there is one."""
+        """End the recording of the current episode, if there is one."""
         if self._close_recorder is not None:
             atexit.unregister(self._close_recorder)
             self._close_recorder()
@@ -152,12 +152,12 @@ class EpisodeRecordings:
         self._close_recorder = self._recorder = self._place = None
 
     def _warn_without_recording(self, error: SdcError) -> None:
-        """Warn that the recording of the present episode ends."""
+        """Warn that the current episode continues without a recording."""
         message = f"{error}; episode {self._episode} goes on without a recording"
         warnings.warn(message, RecordingWarning, stacklevel=3)
 
     def _claim(self, recorder: Recorder) -> None:
-        """Reserve the destination, unless another environment of this process writes there."""
+        """Reserve the destination; fail if another environment of this process writes to it."""
         is_given = recorder is self._settings.target
         place = recorder if is_given or recorder.file is None else recorder.file.resolve()
         if place in _recordings_by_place:
@@ -169,7 +169,7 @@ class EpisodeRecordings:
         self._place = place
 
     def _make_recorder(self, episode: int) -> Recorder:
-        """Recorder of an episode: the given one, or a new one for the file of the episode."""
+        """Return the recorder of an episode: the user's, or a new one for the episode's file."""
         from sdc_taichi.viz.recorder import Recorder, distinct_names
 
         target, every = self._settings.target, self._settings.every
@@ -186,11 +186,11 @@ class EpisodeRecordings:
 _recordings_by_place: weakref.WeakValueDictionary[Path | Recorder | None, EpisodeRecordings] = (
     weakref.WeakValueDictionary()
 )
-"""Recordings in progress in this process, by file or given recorder."""
+"""All recordings in progress in this process, by file or by the user's recorder."""
 
 
 def _check(settings: EpisodeRecorder, size: int) -> None:
-    """Check settings of a batch of ``size`` environments before the first episode."""
+    """Check the settings for a batch of ``size`` environments before the first episode."""
     from sdc_taichi.viz.recorder import MAX_FOCUS, Recorder
 
     target, envs, trigger = settings.target, settings.envs, settings.episode_trigger

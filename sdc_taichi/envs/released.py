@@ -1,15 +1,17 @@
-"""Observations and rewards of the released SustainDC, batched.
+"""Observations and rewards of the released SustainDC code, for batches of data centers.
 
-Source of observations: the main branch of github.com/HewlettPackard/dc-rl at a92b475
-(``sustaindc_env.py``, ``utils/managers.py``, ``envs/carbon_ls.py``). Rewards are those at the time
-of the paper (NeurIPS 2024, 4.5 and F; ``utils/reward_creator.py``, ``utils/make_envs_pyenv.py``).
+Observations follow the main branch of github.com/HewlettPackard/dc-rl at commit a92b475
+(``sustaindc_env.py``, ``utils/managers.py``, ``envs/carbon_ls.py``). Rewards follow the code at the
+time of the paper (NeurIPS 2024, sections 4.5 and F; ``utils/reward_creator.py``,
+``utils/make_envs_pyenv.py``).
 
-Carbon intensity and dry bulb are scaled by their minimum and maximum over the 30 days from the
-first step. That looks at the future, which is why these vectors are not the default. Windows count
-steps, so they cover the stated hours at the 15 minutes of the released code alone.
+Carbon intensity and dry bulb are scaled by their minimum and maximum during the 30 days from the
+first step. This scaling uses information about the future, so these vectors are not the default.
+Windows have a fixed number of steps, so they have the same length in hours as in the released code
+only at steps of 15 minutes.
 
-The vectors exist to reproduce published numbers: columns of the inputs are computed once for each
-series, everything else in every step.
+The vectors exist to reproduce published numbers. Entries of weather and carbon intensity are
+computed once per series; all other entries are computed in every step.
 """
 
 from __future__ import annotations
@@ -32,49 +34,52 @@ from sdc_taichi.sim.sizing import Sizing, released_ranges
 from sdc_taichi.types import F32, F64, I64, StepResult
 
 CI_STEPS = 8
-"""Steps of carbon intensity ahead (``sustaindc_env.py``)."""
+"""Number of future steps of carbon intensity in the observations (``sustaindc_env.py``)."""
 TEMPERATURE_STEPS = 16
-"""Steps of dry bulb ahead (``sustaindc_env.py``)."""
+"""Number of future steps of dry bulb in the observations (``sustaindc_env.py``)."""
 PAST_STEPS = 16
-"""Steps of carbon intensity back (``sustaindc_env.py``)."""
+"""Number of past steps of carbon intensity in the observations (``sustaindc_env.py``)."""
 Z_SCORE_EPSILON = 1e-8
-"""Added to the standard deviation below the z-score, in scaled units (``sustaindc_env.py``)."""
+"""Summand in the denominator of z-scores, which prevents a division by 0, in scaled units
+(``sustaindc_env.py``)."""
 
 SMOOTHED_STEPS = 4
-"""Steps per mean that the trends of carbon intensity are fitted to (``sustaindc_env.py``)."""
+"""Length in steps of the moving average that precedes the fit of carbon-intensity trends
+(``sustaindc_env.py``)."""
 SCALING_DAYS = 30
-"""Days from the first step that scale the inputs, fewer where the year ends (``managers.py``)."""
+"""Length in days of the period from the first step whose range scales the inputs. The period ends
+early at the end of the year (``managers.py``)."""
 
 _SCALED_LIMIT = 10.0
-"""Limit of scaled inputs, which are 0..1 in the first 30 days and may exceed that afterwards."""
+"""Limit of scaled inputs, which are 0..1 in the first 30 days and may exceed this range later."""
 _Z_SCORE_LIMIT = 1.0 / Z_SCORE_EPSILON
-"""Limit of z-scores, which are as large where the window is flat."""
+"""Limit of z-scores; a window of constant values gives z-scores of this size."""
 _AGE_LIMIT_DAYS = 400.0
-"""Limit of ages in days; the longest ``workload.age_horizon_h`` is 365 days."""
+"""Limit of ages, in days; the longest valid ``workload.age_horizon_h`` is 365 days."""
 
 
 def _scaled(name: str, description: str) -> Feature:
-    """Entry that is an input less its minimum, divided by its range."""
+    """Describe an entry whose value is an input minus its minimum, divided by its range."""
     return Feature(name, "scaled", -_SCALED_LIMIT, _SCALED_LIMIT, description)
 
 
 def _slope(name: str, description: str) -> Feature:
-    """Entry that is a trend of a scaled input."""
+    """Describe an entry whose value is the trend of a scaled input per step."""
     return Feature(name, "scaled/step", -_SCALED_LIMIT, _SCALED_LIMIT, description)
 
 
 def _share(name: str, description: str, unit: str = "-") -> Feature:
-    """Entry of 0..1."""
+    """Describe an entry with values of 0..1."""
     return Feature(name, unit, 0.0, 1.0, description)
 
 
 def _age(name: str, description: str) -> Feature:
-    """Entry that is an age of queued tasks."""
+    """Describe an entry whose value is an age of queued tasks, in days."""
     return Feature(name, "d", 0.0, _AGE_LIMIT_DAYS, description)
 
 
 def _window(name: str, what: str, steps: int) -> tuple[Feature, ...]:
-    """Entries about the coming steps of an input."""
+    """Describe the five entries that summarise the coming ``steps`` steps of an input."""
     return (
         _scaled(f"{name}_mean_next", f"mean {what} of the next {steps} steps"),
         Feature(
@@ -101,7 +106,7 @@ def _window(name: str, what: str, steps: int) -> tuple[Feature, ...]:
 
 
 def _age_bins() -> tuple[Feature, ...]:
-    """Entries of the age histogram."""
+    """Describe the entries of the histogram of task ages."""
     edges = [f"{edge:g}" for edge in AGE_EDGES_H]
     closed = tuple(
         _share(f"queue_{low}_{high}h", f"share of the queued tasks aged {low} h to {high} h")
@@ -111,7 +116,7 @@ def _age_bins() -> tuple[Feature, ...]:
 
 
 def ranges(features: Sequence[Feature]) -> tuple[F32, F32]:
-    """Lowest and highest value of each entry, (n,) each."""
+    """Return the lower and the upper end of each entry's range, (n,) each."""
     low, high = ([getattr(f, side) for f in features] for side in ("low", "high"))
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
 
@@ -148,29 +153,29 @@ FEATURES: dict[str, tuple[Feature, ...]] = {
     "agent_dc": (*_OF_ALL_AGENTS, _WORKLOAD, _WORKLOAD_NEXT, _OUTDOOR, _OUTDOOR_NEXT),
     "agent_bat": (*_OF_ALL_AGENTS, _WORKLOAD, _OUTDOOR, _SOC),
 }
-"""Entries of each agent's vector in order; ranges are those of the values as observed.
+"""Entries of each agent's observation vector, in order, with the ranges of the observed values.
 
-The unit ``scaled`` is the input less its minimum over the 30 days from the first step, over the
-range of these days.
+The unit ``scaled`` means that the input's minimum is subtracted and the result divided by the
+input's range. Minimum and range are those of the 30 days from the first step.
 """
 
 _RANGES = {agent: ranges(features) for agent, features in FEATURES.items()}
 
 
 class ReleasedObserver:
-    """Observation vectors of the released code, with 26, 14 and 13 entries.
+    """Computes the observation vectors of the released code, with 26, 14 and 13 entries.
 
-    The inputs are taken from the drivers as they are; the released code cuts its dry bulb at 0 C
-    and 45 C beforehand. An input that is constant over the 30 days from the first step has no range
-    and reads 0. Entries outside the ranges of ``FEATURES`` are cut at them.
+    The vectors use the inputs of the simulator unchanged, whereas the released code clips the dry
+    bulb to 0..45 C. The scaled value of an input that is constant for the 30 days from the first
+    step is 0. Entries are clipped to the ranges in ``FEATURES``.
 
     Args:
-        agents: agents whose vectors are wanted.
+        agents: agents whose vectors ``observe`` returns.
 
     Attributes:
-        features: entries of each agent, in the order of its vector.
+        features: entries of each agent's vector, in order.
         spaces: space of each agent's vector.
-        state_space: space of the vectors of all agents side by side.
+        state_space: space of the concatenated vectors of all agents.
     """
 
     def __init__(self, agents: Sequence[str] = AGENTS) -> None:
@@ -183,10 +188,10 @@ class ReleasedObserver:
         self._observed: tuple[View, dict[str, F64]] | None = None
 
     def reset(self, view: View) -> None:
-        """Scale the inputs by what follows the first step.
+        """Start an episode: compute the ranges that scale the inputs.
 
         Args:
-            view: the view before the first step.
+            view: the controller's view before the first step.
         """
         per_hour, drivers = view.fleet.steps_per_hour, view.drivers
         window = SCALING_DAYS * 24 * per_hour
@@ -207,11 +212,11 @@ class ReleasedObserver:
         self._capacity_kwh = np.where(battery_kwh > 0, battery_kwh, 1.0)
 
     def observe(self, view: View) -> dict[str, F32]:
-        """The vector of each agent before the step to come, (B, entries) each; after ``reset``."""
+        """Return the vector of each agent before the coming step, (B, entries) each."""
         return {agent: self._vector(agent, view) for agent in self._agents}
 
     def state(self, view: View) -> F32:
-        """The vectors of all agents side by side, (B, m); after ``reset``."""
+        """Return the concatenated vectors of all agents before the coming step, (B, m)."""
         return np.concatenate([self._vector(agent, view) for agent in AGENTS], axis=1)
 
     def _vector(self, agent: str, view: View) -> F32:
@@ -223,7 +228,7 @@ class ReleasedObserver:
         return np.maximum(np.minimum(vector, high), low)
 
     def _entries(self, view: View) -> dict[str, F64]:
-        """Entries of all agents by name, (B,) each, before they are cut at their ranges."""
+        """Compute the entries of all agents by name, not yet clipped to their ranges, (B,) each."""
         assert self._ci is not None, "reset comes first"
         assert self._outdoor is not None
         state, last, drivers = view.state, view.last, view.drivers
@@ -231,7 +236,7 @@ class ReleasedObserver:
         time_of_day = self._time_of_day[index % len(self._time_of_day)]
         waiting = state.queue[:, -1].copy()
         tasks = age_histogram(state.queue, self._age_edges_steps).T
-        # Shares of a queue of which rounding alone left some are 0.
+        # A queue that is not empty only because of rounding has age shares of 0.
         counted = np.where(waiting > NEGLIGIBLE_TASKS, waiting, np.inf)
         zero = np.zeros(view.size)
         return {
@@ -253,12 +258,14 @@ class ReleasedObserver:
 
 
 class _ScaledInput:
-    """Entries about an input, scaled by its range over the 30 days from the first step.
+    """Computes the entries that follow from one input, carbon intensity or dry bulb.
+
+    The entries are scaled by the range of the input during the 30 days from the first step.
 
     Args:
         series: the input of each data center.
-        names: names of the columns: the level, trends, and those of ``_window_columns``.
-        columns: function of a series that gives the columns in its unit, (n, columns).
+        names: names of the columns: the level, its trends, then those of ``_window_columns``.
+        columns: function from the values of a series, (n,), to columns in its unit, (n, columns).
     """
 
     def __init__(
@@ -271,7 +278,7 @@ class _ScaledInput:
         self._first_rows = first_rows[self._which]
 
     def is_made_of(self, series: FleetSeries) -> bool:
-        """Whether the columns are those of a series."""
+        """Return True if the columns were computed from this series."""
         mine = self._series
         return (
             mine.values is series.values
@@ -280,7 +287,10 @@ class _ScaledInput:
         )
 
     def begin(self, start: I64, window: int) -> None:
-        """Take the range of the ``window`` steps from the first on, at most to the series' end."""
+        """Compute the range of the input in ``window`` steps from step ``start`` of the year, (B,).
+
+        The window ends early at the end of the series.
+        """
         starts = start % self._series.lengths
         windows = [
             self._distinct[which][first : first + window]
@@ -288,15 +298,15 @@ class _ScaledInput:
         ]
         self._low = np.array([one.min() for one in windows])
         span = np.array([one.max() for one in windows]) - self._low
-        # Without a range all reads 0, as any part of infinity does.
+        # A constant input has no range; dividing by infinity scales all its values to 0.
         self._span = np.where(span > 0, span, np.inf)
 
     def level_at(self, index: I64) -> F64:
-        """The scaled input at steps of the year, (B,)."""
+        """Return the scaled input of each data center at a step of the year, (B,)."""
         return np.asarray((self._series.at(index) - self._low) / self._span)
 
     def at(self, index: I64) -> dict[str, F64]:
-        """Scaled entries by name at steps of the year, (B,) each."""
+        """Return the scaled entries of each data center at a step of the year, by name, (B,)."""
         rows = self._columns.take(self._first_rows + index % self._series.lengths, axis=0)
         columns = dict(zip(self._names, rows.T, strict=True))
         out: dict[str, F64] = {}
@@ -319,36 +329,45 @@ _AGE_BINS = tuple(f.name for f in _age_bins())
 
 
 def _time_of_day_rows(steps_per_day: int) -> F64:
-    """Cosine and sine of the time of day, 0..1, (steps per day, 2)."""
+    """Return cosine and sine of the time of day, scaled to 0..1, (steps per day, 2)."""
     share = np.array([round(step / steps_per_day, 3) for step in range(steps_per_day)])
     angle = 2.0 * np.pi * share
     return np.stack([0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)], axis=1)
 
 
 def _ci_columns(series: F64) -> F64:
-    """Value, slopes to come and past, and window columns, in g/kWh, (n, 8)."""
+    """Return columns of a carbon intensity in g/kWh, (n, 8).
+
+    The columns are the value, its future and past trend per step, and those of ``_window_columns``.
+    """
     following = _ahead(series, CI_STEPS)
     past = [np.roll(series, k) for k in range(PAST_STEPS, 0, -1)]
     slope_past = _weighted_sum(_smoothed_trend_weights(PAST_STEPS + 1), [*past, series])
-    # A year has no past before its first hours: the released code then sees none.
+    # The released code uses a past trend of 0 in the first hours of the year.
     slope_past[:PAST_STEPS] = 0.0
     slope_next = _weighted_sum(_smoothed_trend_weights(CI_STEPS + 1), [series, *following])
     return np.column_stack([series, slope_next, slope_past, _window_columns(series, following)])
 
 
 def _outdoor_columns(series: F64) -> F64:
-    """Value, slope to come, and window columns, in C, (n, 7)."""
+    """Return columns of a dry bulb in C, (n, 7).
+
+    The columns are the value, its future trend per step, and those of ``_window_columns``.
+    """
     following = _ahead(series, TEMPERATURE_STEPS)
     slope = _weighted_sum(_trend_weights(TEMPERATURE_STEPS + 1), [series, *following])
     return np.column_stack([series, slope, _window_columns(series, following)])
 
 
 def _window_columns(now: F64, following: Sequence[F64]) -> F64:
-    """Mean, standard deviation, present excess over the mean, steps to peak and valley, (n, 5).
+    """Summarise the coming steps of a series in five columns, (n, 5).
+
+    The columns are mean and standard deviation of the window, the current value minus this mean,
+    and the steps to the next peak and to the next valley, each divided by the window's length.
 
     Args:
-        now: present values, (n,).
-        following: values of each step of the window, (n,) each.
+        now: current values, (n,).
+        following: values in each later step of the window, (n,) each.
     """
     count = len(following)
     total = np.zeros_like(now)
@@ -371,12 +390,12 @@ def _window_columns(now: F64, following: Sequence[F64]) -> F64:
 
 
 def _ahead(series: F64, steps: int) -> list[F64]:
-    """The series as seen 1, 2, .. ``steps`` steps ahead, (n,) each."""
+    """Return the values of a series 1, 2, .. ``steps`` steps later, (n,) each."""
     return [np.roll(series, -k) for k in range(1, steps + 1)]
 
 
 def _weighted_sum(weights: F64, values: Sequence[F64]) -> F64:
-    """Sum of arrays times weights, in order."""
+    """Return the weighted sum of arrays, added in order so that results repeat bit for bit."""
     total = np.zeros_like(values[0])
     for weight, value in zip(weights, values, strict=True):
         total = total + weight * value
@@ -384,13 +403,16 @@ def _weighted_sum(weights: F64, values: Sequence[F64]) -> F64:
 
 
 def _trend_weights(points: int) -> F64:
-    """Weights of the least-squares slope per step, (points,)."""
+    """Return the weights of points whose weighted sum is their least-squares slope, (points,)."""
     position = np.arange(points) - (points - 1) / 2.0
     return np.asarray(position / np.sum(position**2))
 
 
 def _smoothed_trend_weights(points: int) -> F64:
-    """Weights of a least-squares slope per step over means of ``SMOOTHED_STEPS``, (points,)."""
+    """Return the weights of points for the slope of their moving average, (points,).
+
+    The slope is a least-squares fit to averages of ``SMOOTHED_STEPS`` points.
+    """
     smoothed = points - SMOOTHED_STEPS + 1
     return np.convolve(_trend_weights(smoothed), np.full(SMOOTHED_STEPS, 1.0 / SMOOTHED_STEPS))
 
@@ -398,32 +420,38 @@ def _smoothed_trend_weights(points: int) -> F64:
 DROPPED_TASK_REWARD = -10.0
 """Reward of a dropped task (paper, F.2)."""
 QUEUED_TASK_REWARD = -0.1
-"""Reward of a queued task at full factor, one over 10 (paper, F.2)."""
+"""Reward of a queued task at an end-of-day factor of 1, which is -1/10 (paper, F.2)."""
 END_OF_DAY_H = 23.0
-"""Hour of the day from which queued tasks cost (paper, F.2)."""
+"""Hour of the day from which queued tasks reduce the reward (paper, F.2)."""
 END_OF_DAY_FACTORS = (0.95833, 0.98935)
-"""Shares of the day at which the factor is 0 and 1, as printed (paper, F.2): 23:00 and, by its
-digits, just before 23:45, the start of the last quarter hour, where the factor is 1.0075."""
+"""Shares of the day at which the end-of-day factor is 0 and 1, as printed in the paper (F.2).
+
+The first is 23:00. The second is slightly before 23:45, the start of the last quarter hour, so the
+factor is 1.0075 at 23:45.
+"""
 LOWEST_POWER_FACTOR = 0.9
-"""Lower bound of the facility's power over the lowest IT power (``make_envs_pyenv.py``)."""
+"""Ratio of the lower bound of the facility's power to the lowest IT power
+(``make_envs_pyenv.py``)."""
 
 
 def footprint_reward(norm_ci: F64, grid_kwh: F64, low_kwh: F64, high_kwh: F64) -> F64:
-    """Reward of the battery agent, and the energy part of the load agent's (paper, F.2), (B,).
+    """Compute the footprint reward: energy times carbon intensity, both scaled to 0..1, (B,).
+
+    It is the reward of the battery agent and a summand of the load agent's reward (paper, F.2).
 
     Args:
-        norm_ci: carbon intensity as a share of its range, 0..1, (B,).
-        grid_kwh: energy of the step with the battery, in kWh, (B,).
-        low_kwh: least energy of a step, in kWh, (B,).
-        high_kwh: greatest energy of a step, in kWh, (B,).
+        norm_ci: carbon intensity, scaled to 0..1 by its range, (B,).
+        grid_kwh: grid energy of the step, battery included, in kWh, (B,).
+        low_kwh: lower bound of the energy of a step, in kWh, (B,).
+        high_kwh: upper bound of the energy of a step, in kWh, (B,).
     """
     return -norm_ci * (grid_kwh - low_kwh) / (high_kwh - low_kwh)
 
 
 def load_penalty(dropped_tasks: F64, queue_tasks: F64, day_share: F64) -> F64:
-    """Penalty of the load agent for dropped tasks and a queue at the end of the day, (B,).
+    """Compute the load agent's penalty for dropped tasks and for a queue at the end of a day, (B,).
 
-    Paper, F.1 and F.2: the factor of the queue rises linearly from 23:00 on.
+    The factor of the queue rises linearly from 23:00 on (paper, F.1 and F.2).
 
     Args:
         dropped_tasks: tasks dropped in the step, (B,).
@@ -436,10 +464,9 @@ def load_penalty(dropped_tasks: F64, queue_tasks: F64, day_share: F64) -> F64:
 
 
 def cooling_reward(facility_kw: F64, low_kw: F64, high_kw: F64) -> F64:
-    """Reward of the cooling agent: IT and HVAC power as a share of its range, (B,).
+    """Compute the cooling agent's reward, the negative of IT and HVAC power scaled to 0..1, (B,).
 
-    Source: ``reward_creator.py``.
-
+    The formula is that of ``reward_creator.py`` in the released code.
 
     Args:
         facility_kw: IT and HVAC power of the step, in kW, (B,).
@@ -450,11 +477,12 @@ def cooling_reward(facility_kw: F64, low_kw: F64, high_kw: F64) -> F64:
 
 
 def power_bounds_kw(fleet: Fleet, sizing: Sizing, precision: Precision) -> tuple[F64, F64]:
-    """Bounds of IT and HVAC power, in kW, (B,) each.
+    """Compute the bounds by which rewards scale IT and HVAC power, in kW, (B,) each.
 
-    The range goes from 0.9 times the lowest IT power of 15..22 C and 0..100 % load to the design
-    power of the facility, which is 1.1 times highest IT, rated tower and chiller power under
-    ``released`` sizing (``make_envs_pyenv.py``). Energies of a step are these times its length.
+    The lower bound is 0.9 times the lowest IT power at setpoints of 15..22 C and loads of 0..100 %.
+    The upper bound is the design power of the facility. Under ``released`` sizing this is 1.1 times
+    the sum of the highest IT power and the rated powers of tower and chiller
+    (``make_envs_pyenv.py``).
     """
     halls = [(c.hall, c.servers, c.hvac) for c in fleet.configs]
     distinct = dict(zip(halls, fleet.configs, strict=True))
@@ -466,10 +494,10 @@ def power_bounds_kw(fleet: Fleet, sizing: Sizing, precision: Precision) -> tuple
 
 
 class ReleasedRewards:
-    """Rewards of the released code at the time of the paper, before agents share them.
+    """Computes the individual rewards of the released code at the time of the paper.
 
-    Carbon intensity counts as its place between the minimum and maximum of its series, a year as a
-    rule (``CI_Manager`` of that time), in the step that the reward is for.
+    Carbon intensity is scaled to 0..1 by minimum and maximum of its series, which usually covers a
+    year (``CI_Manager`` in the code of that time). The value is that of the rewarded step.
     """
 
     def __init__(self) -> None:
@@ -478,13 +506,13 @@ class ReleasedRewards:
         self._low_ci = self._ci_span = np.zeros(0)
 
     def reset(self, view: View) -> None:
-        """Take the ranges of the fleet and its inputs.
+        """Start an episode: compute the ranges of power and carbon intensity.
 
         Args:
-            view: the view before the first step.
+            view: the controller's view before the first step.
 
         Raises:
-            DataError: a carbon intensity that never changes, so has no range.
+            DataError: the carbon intensity of a data center is constant, so it has no range.
         """
         if self._fleet is not view.fleet:
             self._bounds_kw = power_bounds_kw(view.fleet, view.sizing, view.precision)
@@ -502,14 +530,14 @@ class ReleasedRewards:
         self._low_ci, self._ci_span = low, high - low
 
     def rewards(self, result: StepResult, view: View) -> dict[str, F64]:
-        """Rewards of a step.
+        """Compute the individual rewards of a step.
 
         Args:
-            result: the step.
-            view: the view after it.
+            result: result of the step.
+            view: the controller's view after the step.
 
         Returns:
-            r_LS, r_DC and r_BAT by agent, (B,) each.
+            The rewards r_LS, r_DC and r_BAT of the paper by agent, (B,) each.
         """
         low_kw, high_kw = self._bounds_kw
         footprint = footprint_reward(

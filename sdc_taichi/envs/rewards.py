@@ -1,7 +1,8 @@
-"""Rewards of agents: weighted sums of named terms, or a function that the user supplies.
+"""Rewards of agents: weighted sums of named terms, or the values of a user's function.
 
-A user's reward function takes the result of a step and the view after it. The option ``rewards``
-takes the function, the name under which ``register_reward`` registered it, or its import path.
+A user's reward function takes the result of a step and the controller's view after the step. The
+option ``rewards`` takes the function itself, its import path, or the name under which
+``register_reward`` registered it.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ from sdc_taichi.user_functions import (
 )
 
 RewardFunction = Callable[[StepResult, View], Any]
-"""A user's reward function of the result of a step and the view after it. It returns rewards (B,)
-that every learning agent receives, or a dict of them by learning agent."""
+"""Reward function of a user. It takes the result of a step and the view after the step. It returns
+rewards, (B,), for every learning agent, or a dict of rewards, (B,) each, by learning agent."""
 
 _COUNTED_ONCE = ("default", "bill")
-"""Reward sets whose joint reward counts each term once, even if several agents share the term; the
-joint reward of all other sets is the sum over the agents."""
+"""Reward sets whose joint reward counts each term once, even if several agents have this term. The
+joint reward of all other sets is the sum of the agents' rewards."""
 SCALED_SETS = (*_COUNTED_ONCE, "paper")
-"""Reward sets that are terms weighed by the scales of ``AGENT_DEFINITIONS``."""
+"""Reward sets that are sums of terms, multiplied by the scales of ``AGENT_DEFINITIONS``."""
 REWARD_SETS = (*SCALED_SETS, "sustaindc")
-"""Rewards that the option ``rewards`` takes by name, besides registered functions."""
+"""Names of the built-in reward sets that the option ``rewards`` accepts."""
 
 MOST_SCALE = 1e9
-"""Largest absolute scale of a term, which leaves room for prices in any currency."""
+"""Maximum absolute scale of a term, large enough for prices in any currency."""
 BILLED_SHARE = 0.5
-"""Share of the design power that is billed even if the episode draws less."""
+"""Share of the design power that is billed even if the power never reaches it."""
 MAX_PEAK_KW = POWER_LIMITS_W[1] / 1e3
-"""Highest power that can be billed, in kW."""
+"""Maximum power that a saved state may contain as billed power, in kW."""
 BILL_DAYS = 30.0
 """Days between two bills."""
 
@@ -50,36 +51,36 @@ _registered: dict[str, RewardFunction] = {}
 
 
 def register_reward(name: str, reward: RewardFunction) -> None:
-    """Make a function available as ``rewards=name``.
+    """Register a reward function, so that the option ``rewards`` accepts its name.
 
     Args:
-        name: an identifier that no other reward has.
-        reward: the function; see ``RewardFunction``. It replaces an earlier function of the same
-            module and name, for example when a notebook cell runs again.
+        name: Python identifier that no other reward uses.
+        reward: the reward function; see ``RewardFunction``. It replaces an earlier function of the
+            same module and name, for example when a notebook cell runs again.
 
     Raises:
-        ConfigError: the name belongs to another function, or ``reward`` is no function.
+        ConfigError: the name belongs to another function, or ``reward`` is not a function.
     """
     register_function("reward", name, reward, _registered, reserved=REWARD_SETS)
 
 
 class Rewards:
-    """Rewards of the agents that learn.
+    """Computes the rewards of the agents that learn.
 
     Args:
-        rewards: the option ``rewards``: a name, scales by agent and term, or a function or its
-            import path.
-        collaboration: weight of an agent's individual reward in the reward it receives, 0..1.
-        agents: agents that learn.
-        days: length of the episodes in days.
+        rewards: value of the option ``rewards``: a name, scales by agent and term, a function, or
+            the import path of a function.
+        collaboration: weight of an agent's individual reward in the reward that it receives, 0..1.
+        agents: names of the agents that learn.
+        days: length of an episode, in days.
 
     Attributes:
-        identity: plain values that identify the rewards: scales, or the name of a function.
-        used_terms: names of the terms in the rewards; empty for functions and for the rewards of
-            the released code.
+        identity: plain values that identify the rewards: the scales, or the path of a function.
+        used_terms: names of the terms with a scale; empty for functions and for the rewards of the
+            released code.
 
     Raises:
-        ConfigError: an unknown name, agent or term, or a path without a function.
+        ConfigError: a name, agent or term is unknown, or the import path leads to no function.
     """
 
     def __init__(
@@ -125,7 +126,8 @@ class Rewards:
             view: the view before the first step.
 
         Raises:
-            DataError: a carbon intensity that never changes, with rewards of the released code.
+            DataError: the carbon intensity is constant, so the released code's rewards cannot be
+                scaled by its range.
         """
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
         self._step_h = view.step_h
@@ -134,19 +136,20 @@ class Rewards:
             self._released.reset(view)
 
     def rewards(self, result: StepResult, view: View) -> tuple[dict[str, F64], F64]:
-        """Rewards of a step.
+        """Compute the rewards of a step.
 
         Args:
-            result: the step.
-            view: the view after it.
+            result: result of the step.
+            view: the controller's view after the step.
 
         Returns:
-            Rewards by learning agent, (B,) each, and their joint reward, (B,). ``default`` and
-            ``bill`` count each term once in the joint reward; a user's function that returns one
-            reward for all agents gives that; otherwise it is the sum over the learning agents.
+            Rewards by learning agent, (B,) each, and the joint reward, (B,). Reward sets
+            ``default`` and ``bill`` count each term once in the joint reward. If a user's function
+            returns one reward for all agents, this is the joint reward. In all other cases the
+            joint reward is the sum of the learning agents' rewards.
 
         Raises:
-            SdcError: a user's function returned values of another shape, or not finite.
+            SdcError: a user's function returned values of a wrong shape, or not finite.
         """
         self._peak_before_kw = self._peak_kw
         if self._scales:
@@ -169,20 +172,23 @@ class Rewards:
         return _with_sum(self._shared([*self._released.rewards(result, view).values()]))
 
     def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
-        """Unscaled terms of the last step by name, (B,) each, used by the rewards or not."""
+        """Return unscaled terms of the last step by name, (B,) each; by default all terms."""
         self._context.begin_step(result.step, self._peak_before_kw)
         return {name: TERMS[name](result, self._context) for name in names}
 
     def peaks_kw(self) -> F64:
-        """Highest billed power of the episode before and after the last step, in kW, (2, B)."""
+        """Return the highest billed power before and after the last step, in kW, (2, B)."""
         return np.stack([self._peak_before_kw, self._peak_kw])
 
     def load_peaks_kw(self, peaks_kw: F64) -> None:
-        """Restore the result of ``peaks_kw``, (2, B), in an episode that has been reset."""
+        """Restore values that ``peaks_kw`` returned, in kW, (2, B); call ``reset`` before."""
         self._peak_before_kw, self._peak_kw = peaks_kw.copy()
 
     def _stage_function(self, context: Any, result: Any) -> dict[str, F64]:
-        """Rewards by learning agent, ``joint`` and ``peak_kw`` of a step, (B,) each."""
+        """Compute rewards by agent, the joint reward and the peak power of a step, (B,) each.
+
+        ``CompiledStage`` traces this function.
+        """
         result = _WithStep(result, self._step_h)
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
         individual = [_weighed(terms, self._scales[agent]) for agent in AGENTS]
@@ -192,14 +198,14 @@ class Rewards:
         return by_agent | {"joint": joint, "peak_kw": _peak_kw(context.peak_kw, result)}
 
     def _shared(self, individual: Sequence[F64]) -> dict[str, F64]:
-        """Collaborative rewards by learning agent, from the individual rewards of ``AGENTS``."""
+        """Return collaborative rewards by learning agent from the individual ones of ``AGENTS``."""
         shared = collaborative_rewards(individual, self._collaboration)
         by_agent = dict(zip(AGENTS, shared, strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
 
 
 class _WithStep:
-    """A traced result of a step, and the length of the step, in h, which is no array."""
+    """Result of a step during tracing, with the step's length in h as a plain number."""
 
     def __init__(self, result: Any, step_h: float) -> None:
         self._result, self.step_h = result, step_h
@@ -209,7 +215,7 @@ class _WithStep:
 
 
 def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:
-    """Collaborative rewards R_i = a r_i + (1 - a)/2 sum_{j != i} r_j (paper, section 4.5).
+    """Compute collaborative rewards R_i = a r_i + (1 - a)/2 sum_{j != i} r_j (paper, section 4.5).
 
     Args:
         individual: r_LS, r_DC and r_BAT, (B,) each.
@@ -223,12 +229,12 @@ def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:
 
 
 def _peak_kw(before_kw: F64, result: StepResult) -> F64:
-    """Highest power of the episode up to the end of this step, in kW, (B,)."""
+    """Return the highest power of the episode up to the end of this step, in kW, (B,)."""
     return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    """Scales of all agents; an agent without an entry has those of reward set ``default``."""
+    """Check a user's scales; agents without an entry receive those of reward set ``default``."""
     for agent, scales in given.items():
         if agent not in AGENTS:
             raise ConfigError(
@@ -254,7 +260,7 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
 
 
 def _function_named(given: Any) -> RewardFunction:
-    """A registered function, or one by its import path ``module:name``."""
+    """Return the reward function with a registered name or an import path ``module:name``."""
     function: RewardFunction = function_named(
         "rewards",
         given,
@@ -267,7 +273,7 @@ def _function_named(given: Any) -> RewardFunction:
 def _checked_by_agent(
     returned: Mapping[Any, Any], agents: Sequence[str], size: int
 ) -> dict[str, F64]:
-    """Checked values of a user's function for each learning agent, (B,) each."""
+    """Check the dict that a user's function returned; return rewards by learning agent, (B,)."""
     for agent in returned:
         if agent not in AGENTS:
             raise SdcError(
@@ -282,18 +288,18 @@ def _checked_by_agent(
 
 
 def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
-    """Rewards by agent, and their sum, (B,)."""
+    """Return rewards by agent together with their sum, (B,)."""
     return by_agent, _sum(list(by_agent.values()))
 
 
 def _weighed(terms: Mapping[str, F64], scales: Mapping[str, float]) -> F64:
-    """Sum of terms times their scales, (B,); 0 without any."""
+    """Return the sum of terms times their scales, (B,); 0 if there are no scales."""
     none: Any = 0.0
     return _sum([scale * terms[name] for name, scale in scales.items()] or [none])
 
 
 def _sum(values: Sequence[F64]) -> F64:
-    """Sum in order for every batch size; ``np.sum`` adds in another order for size 1."""
+    """Add arrays in order; ``np.sum`` uses another order for batches of one, with other bits."""
     total, *others = values
     for other in others:
         total = total + other

@@ -1,4 +1,4 @@
-"""One data center as a Gymnasium environment with one learner: an agent, or all agents as one."""
+"""One data center as a Gymnasium environment with one learner, for one agent or all agents."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from sdc_taichi.types import F32, F64
 
 
 class AgentLearner:
-    """One learning agent with its collaborative reward.
+    """A learner that controls one agent and receives this agent's collaborative reward.
 
     Args:
-        core: data centers in which it alone learns.
+        core: batch of data centers with exactly one learning agent.
 
     Attributes:
         observation_space: space of the agent's observation in one environment.
         action_space: space of the agent's action in one environment.
-        features: features of its observation, in order.
+        features: features of the agent's observation, in order.
     """
 
     def __init__(self, core: Core) -> None:
@@ -47,37 +47,37 @@ class AgentLearner:
         self.features = core.features[self._agent]
 
     def actions(self, given: Any) -> dict[str, Any]:
-        """Actions of the agent, which are those of the learner."""
+        """Convert the learner's actions to actions by agent; the values are the same."""
         return {self._agent: given}
 
     def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """Actions of the learner, which are those of the agent, (B,) or (B, k)."""
+        """Convert actions by agent to the learner's actions, (B,) or (B, k)."""
         return by_agent[self._agent].astype(self.action_space.dtype)
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
-        """The agent's observation, (B, n)."""
+        """Return the agent's observation, (B, n)."""
         return by_agent[self._agent]
 
     def reward(self, transition: Transition) -> F64:
-        """The agent's reward, (B,)."""
+        """Return the agent's reward, (B,)."""
         return np.array(transition.rewards[self._agent])
 
 
 class JointLearner:
-    """All learning agents as one learner.
+    """A single learner that controls all learning agents.
 
-    Its observation is the concatenation of their observations with each feature once. The shared
-    state would include features that the option ``features`` leaves out. Its reward is
-    ``Transition.joint_reward``; if all three agents learn, the weights of ``collaboration`` cancel
-    in sums over the agents.
+    The learner's observation concatenates the observations of the agents and contains each feature
+    once. Unlike the shared state, it leaves out features that no agent observes. The learner's
+    reward is ``Transition.joint_reward``. If all three agents learn, the sum of their rewards does
+    not depend on the weight ``collaboration``.
 
     Args:
-        core: data centers in which the agents learn.
+        core: batch of data centers in which the agents learn.
 
     Attributes:
-        observation_space: space of all observations side by side in one environment.
-        action_space: space of all actions side by side in one environment.
-        features: features of its observation, in order.
+        observation_space: space of the concatenated observations in one environment.
+        action_space: space of the concatenated actions in one environment.
+        features: features of the learner's observation, in order.
     """
 
     def __init__(self, core: Core) -> None:
@@ -95,10 +95,10 @@ class JointLearner:
         self.action_space = _actions_side_by_side([core.action_spaces[a] for a in core.agents])
 
     def actions(self, given: Any) -> dict[str, Any]:
-        """Columns of the learner's actions, (B, k), for each agent.
+        """Split the learner's actions, (B, k), into actions by agent.
 
         Raises:
-            SdcError: actions of another shape.
+            SdcError: the actions have a wrong shape.
         """
         given = checked_array(given, "actions")
         shape = (self._core.num_envs, *(self.action_space.shape or ()))
@@ -114,37 +114,42 @@ class JointLearner:
         return out
 
     def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """Actions side by side, (B, k)."""
+        """Concatenate actions by agent to the learner's actions, (B, k)."""
         size = self._core.num_envs
         parts = [by_agent[agent].reshape(size, -1) for agent in self._core.agents]
         return np.concatenate(parts, axis=1).astype(self.action_space.dtype)
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
-        """Observations side by side, each feature once, (B, n)."""
+        """Concatenate observations by agent, with each feature once, (B, n)."""
         parts = [_features(by_agent[a])[:, entries] for a, entries in self._new_entries.items()]
         features: F32 = np.concatenate(parts, axis=1)
         of_agent = by_agent[self._core.agents[0]]
         return {**of_agent, "features": features} if isinstance(of_agent, dict) else features
 
     def reward(self, transition: Transition) -> F64:
-        """The reward of all agents together, (B,)."""
+        """Return the joint reward of all learning agents, (B,)."""
         return np.array(transition.joint_reward)
 
 
 Learner: TypeAlias = AgentLearner | JointLearner
-"""Conversion between the single learner of a batch and its agents; environments come first."""
+"""Converts between the single learner of a batch and its agents. The first axis of all arrays is
+the environment."""
 
 
 def make_learner(core: Core, agent: str | None) -> Learner:
-    """Learner for one agent, or with None for all learning agents together."""
+    """Create the learner for one agent, or for all learning agents if ``agent`` is None."""
     return JointLearner(core) if agent is None else AgentLearner(core)
 
 
 def learning_agent(agent: str | None, registered_agent: str | None) -> str | None:
-    """The single learning agent, or None if all ``agents`` learn as one.
+    """Return the only learning agent, or None if one learner controls all ``agents``.
+
+    Args:
+        agent: the user's argument ``agent``, or None.
+        registered_agent: agent of the Gymnasium id, or None.
 
     Raises:
-        ConfigError: an agent that differs from that of the id.
+        ConfigError: ``agent`` differs from the agent of the Gymnasium id.
     """
     if registered_agent is not None and agent not in (None, registered_agent):
         raise ConfigError(
@@ -154,7 +159,7 @@ def learning_agent(agent: str | None, registered_agent: str | None) -> str | Non
 
 
 def _features_box(core: Core, agent: str) -> spaces.Box:
-    """Space of an agent's features, without the heat map."""
+    """Return the space of an agent's features, without the heat map."""
     space = core.observation_spaces[agent]
     features = space["features"] if isinstance(space, spaces.Dict) else space
     assert isinstance(features, spaces.Box)
@@ -162,7 +167,7 @@ def _features_box(core: Core, agent: str) -> spaces.Box:
 
 
 def _features(observation: Observation) -> F32:
-    """Features of an observation, without the heat map."""
+    """Return the features of an observation, without the heat map."""
     return observation["features"] if isinstance(observation, dict) else observation
 
 
@@ -176,21 +181,22 @@ def _actions_side_by_side(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
 
 
 class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
-    """One data center with one learner.
+    """Gymnasium environment of one data center with one learner.
 
-    Episodes end by truncation, as their length is a choice and the data center runs on. Infos after
-    ``reset`` are ``start_day`` and drawn inputs; infos of a step are every (B,) quantity of
-    ``StepResult`` by name and the costs of the option ``costs``.
+    Episodes end by truncation, because their length is a choice and a data center has no final
+    state. Infos of ``reset`` are ``start_day`` and the randomly drawn inputs. Infos of a step are
+    the facility's quantities of ``StepResult`` by name, and the costs of the option ``costs``.
 
     Args:
         config: a preset, a file or a config.
-        agent: agent that learns while ``others`` commands the rest; None is all ``agents`` as one.
-        registered_agent: set by the ids of one agent.
+        agent: the only learning agent; the controller ``others`` commands the rest. With None one
+            learner controls all ``agents``.
+        registered_agent: agent of the Gymnasium id, if the id has a single agent.
         arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
-            fields of ``EnvOptions``, as docs/environments.md lists them.
+            fields of ``EnvOptions``; see docs/environments.md.
 
     Raises:
-        SdcError: a config or option that is not valid.
+        SdcError: a config or option is not valid.
     """
 
     metadata: dict[str, Any] = METADATA
@@ -215,11 +221,12 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: seed of all randomness from here on; None continues the present generator.
-            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0.
+            seed: seed of the random generator; None continues the current generator.
+            options: dict with ``start_day``, a day as ``MM-DD`` or as number of the day in the
+                year, from 0.
 
         Raises:
-            ConfigError: a seed, option or day that is not valid.
+            ConfigError: the seed, an option or the day is not valid.
         """
         observations = self.core.reset(seed, start_day_option(options))
         super().reset(seed=None if seed is None else int(seed))
@@ -227,11 +234,11 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         return observation, first_info(self.core)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance by one step.
+        """Advance the data center by one step.
 
         Raises:
-            SdcError: an action outside its space.
-            RuntimeStateError: before ``reset``, or after the end of the episode.
+            SdcError: the action is outside its space.
+            RuntimeStateError: the environment has not been reset, or the episode is over.
         """
         transition = self.core.step(self._learner.actions([action]))
         observation = first_of_batch(self._learner.observation(transition.observations))

@@ -1,12 +1,14 @@
-"""Observation entries that depend on time alone, as rows that data centers of a site share.
+"""Precomputed rows of the observation entries that depend on time and site alone.
 
 Clock, weather, carbon intensity, prices and arriving work depend on the step of the year and the
-site, and on nothing that happens in the data center. Their entries are therefore computed for many
-steps at once, a row for each step and distinct site, and an observation copies its row:
+site, and not on what happens in the data center. Their entries are therefore computed for many
+steps at once, with one row per step and distinct site. An observation copies its row. The number of
+precomputed rows depends on the case:
 
-- rows of all steps of the year, if they fit into memory;
-- else, or if episodes draw their inputs, rows of a stretch of coming steps;
-- if forecasts have errors, rows of a single step, one for each data center.
+- By default the rows of all steps of the year are computed, if they fit into memory.
+- If they do not fit, or if episodes draw their inputs at random, the rows of a block of coming
+  steps are computed.
+- If forecasts have errors, the rows of a single step are computed, one for each data center.
 """
 
 from __future__ import annotations
@@ -32,26 +34,25 @@ from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.types import F32, I64
 
 MAX_ROW_BYTES = 2**28
-"""Most memory of the rows of one observer, in bytes; series that need more are read in
-stretches."""
+"""Maximum memory of an observer's rows for a whole year, in bytes. Larger tables are computed block
+by block."""
 STRETCH_BYTES = 2**23
-"""Memory of the rows of a stretch, in bytes: few enough that they stay in the processor's cache."""
+"""Memory of the rows of one block of steps, in bytes, small enough for the processor's cache."""
 _ENDLESS = 2**62
-"""Length of rows that do not repeat, in steps."""
+"""Number of steps, larger than any episode, that marks rows without an end or a repetition."""
 _ALL = slice(None)
 
 
 class TimeRows:
-    """Scaled time entries of a fleet, arranged for each observation.
+    """Computes rows of scaled entries that depend on time alone, for the data centers of a fleet.
 
     Args:
         features: features that depend on time alone, from ``time_features``.
         forecasts: carbon intensity, weather and prices at the leads of ``features``.
-        columns: for each observation, by name, the column of a row from which each of its entries
-            comes.
+        columns: for each agent's observation, the column of a row to which each entry belongs.
         steps_per_hour: number of steps in an hour.
-        new_inputs: whether episodes may have other inputs than those before, for which rows of all
-            steps would not pay.
+        new_inputs: True if inputs may differ from episode to episode. Rows of the whole year are
+            then not computed, because only one episode would use them.
     """
 
     def __init__(
@@ -72,7 +73,8 @@ class TimeRows:
         self._time_of_year = _sine_and_cosine(HOURS_PER_YEAR * steps_per_hour)
         self._new_inputs = new_inputs
         self._arranged: dict[str, F32] = {}
-        # Steps after reset that the rows are for, and the place of each data center's row.
+        # Range of the steps since reset that the rows cover, then the index of each data center's
+        # first row and the number of rows after which its rows repeat, (B,) each.
         self._steps = range(0)
         self._first_rows = self._lengths = np.zeros(0, dtype=np.int64)
 
@@ -98,14 +100,14 @@ class TimeRows:
         self._site_dcs, self._site_of = _distinct(drivers.start, *(x for key in keys for x in key))
 
     def rows(self, view: View) -> tuple[F32, dict[str, F32], I64]:
-        """Rows for a view.
+        """Return the rows that contain the entries of a view.
 
         Args:
-            view: the view that is observed.
+            view: the controller's view before a step.
 
         Returns:
-            Rows in the order of the features, (rows, width), rows arranged for each observation,
-            (rows, n), and the number of the row of each data center, (B,).
+            Rows in the order of the features, (rows, width); the same rows in the order of each
+            agent's observation, (rows, n) each; and the index of each data center's row, (B,).
         """
         step = view.state.step
         if step not in self._steps:
@@ -114,7 +116,10 @@ class TimeRows:
         return self._values, self._arranged, row_numbers
 
     def _fill_year(self, drivers: Drivers) -> bool:
-        """Compute rows of all steps, unless series end within a year or need too much memory."""
+        """Compute the rows of all steps of the year; return False if that is not possible.
+
+        It is not possible if series do not cover whole years, or if the rows need too much memory.
+        """
         series = self._forecasts.series
         length = series[0].lengths
         alike = all(np.array_equal(one.lengths, length) for one in series)
@@ -132,7 +137,7 @@ class TimeRows:
         return True
 
     def _fill_stretch(self, step: int) -> None:
-        """Compute rows from a step on, as many as memory and forecasts allow."""
+        """Compute the rows of a block of steps, the first of which is ``step`` since reset."""
         dcs = self._site_dcs
         most = len(self._time_of_day) if self._forecasts.are_perfect else 1
         count = min(max(STRETCH_BYTES // (len(dcs) * self._row_bytes), 1), most)
@@ -148,12 +153,12 @@ class TimeRows:
         self._first_rows, self._lengths, self._steps = first_rows, lengths, steps
 
     def _entries(self, index: I64, dc: I64, step: int = 0) -> F32:
-        """Scaled entries of data centers ``dc`` at steps ``index`` of the year, (n, width).
+        """Compute the scaled entries of n pairs of data center and step, (n, width).
 
         Args:
-            index: steps since the start of the year, (n,).
-            dc: data center of each, (n,).
-            step: steps since reset, where forecasts have errors.
+            index: step of each pair, from the start of the year, (n,).
+            dc: index of the data center of each pair, (n,).
+            step: number of steps since reset, on which forecast errors depend.
         """
         day, year = self._time_of_day, self._time_of_year
         ci, outdoor, wet_bulb, price, demand = self._forecasts.at(index, dc, step)
@@ -173,19 +178,19 @@ class TimeRows:
 
 
 class Forecasts:
-    """Carbon intensity, weather, prices and work of a fleet at present and at each lead.
+    """Current values and forecasts of carbon intensity, weather and prices, and arriving work.
 
     Args:
         steps_per_hour: number of steps in an hour.
-        ci_leads_h: leads of carbon intensity and price in h, rising multiples of the step.
-        weather_leads_h: leads of both temperatures in h, rising multiples of the step.
+        ci_leads_h: leads of carbon intensity and price, in h; increasing multiples of the step.
+        weather_leads_h: leads of dry and wet bulb, in h; increasing multiples of the step.
 
     Attributes:
         series: series of the episode: carbon intensity, dry bulb, wet bulb, price, arriving work.
-        are_perfect: whether forecasts have no errors.
+        are_perfect: True if forecasts have no errors.
 
     Raises:
-        ConfigError: leads that are not valid.
+        ConfigError: a lead is not valid.
     """
 
     def __init__(
@@ -202,13 +207,13 @@ class Forecasts:
         self.are_perfect = True
 
     def reset(self, view: View) -> bool:
-        """Start an episode, with the errors of the view.
+        """Start an episode with the inputs and the forecast errors of a view.
 
         Args:
-            view: the view before the first step.
+            view: the controller's view before the first step.
 
         Returns:
-            Whether the series differ from those of the episode before.
+            True if the series differ from those of the previous episode.
         """
         drivers, self._error, self._walks = view.drivers, view.forecast_error, view.walks
         self.are_perfect = self._error == PERFECT
@@ -225,19 +230,21 @@ class Forecasts:
         return True
 
     def at(self, index: I64, dc: I64, step: int = 0) -> list[F32]:
-        """Inputs at present and as forecast for each lead; the present has no error.
+        """Return current values, which have no error, and forecasts of n pairs of step and site.
 
         Args:
-            index: steps since the start of the year, (n,).
-            dc: data center of each, (n,); all of them in order where forecasts have errors.
-            step: steps since reset.
+            index: step of each pair, from the start of the year, (n,).
+            dc: index of the data center of each pair, (n,). If forecasts have errors, ``dc`` must
+                contain all data centers in order.
+            step: number of steps since reset.
 
         Returns:
             Carbon intensity in g/kWh, (1 + CI leads, n), dry bulb and wet bulb in C, (1 + weather
             leads, n), price relative to its mean, (1 + CI leads, n), arriving work, (1, n).
 
         Raises:
-            RuntimeStateError: with errors, a step before one seen already.
+            RuntimeStateError: forecasts have errors, and ``step`` is earlier than in a previous
+                call.
         """
         values = [series.at(index, dc) for series in self._extended]
         if self._walks is None or self.are_perfect:
@@ -257,11 +264,13 @@ class Forecasts:
 
 
 class ExtendedSeries:
-    """A series of each data center in f32, repeated past its end by the longest lead.
+    """Series of each data center in f32, extended past its end by the longest lead.
+
+    The extension repeats the first values, so that a look-up at a lead needs no modulo.
 
     Args:
-        table: the series.
-        leads: 0 for the present, then the leads in steps, (1 + k,).
+        table: the series of each data center.
+        leads: 0 for the current value, then k leads in steps, (1 + k,).
     """
 
     def __init__(self, table: FleetSeries, leads: I64) -> None:
@@ -275,21 +284,21 @@ class ExtendedSeries:
         self._leads = leads[:, None]
 
     def at(self, index: I64, dc: I64 | slice = _ALL) -> F32:
-        """Values of data centers ``dc`` at steps ``index`` and at each lead, (1 + k, n)."""
+        """Return values of data centers ``dc`` at steps ``index`` plus each lead, (1 + k, n)."""
         first = self._first_entries[dc] + index % self._lengths[dc]
         return np.asarray(self._values.take(first + self._leads))
 
 
 def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
-    """Leads in steps, (n,).
+    """Convert leads from hours to steps, (n,).
 
     Args:
-        name: name of the option, for errors.
+        name: name of the option, for error messages.
         leads_h: leads in h.
         steps_per_hour: number of steps in an hour.
 
     Raises:
-        ConfigError: leads that do not rise, or that are no positive multiples of the step.
+        ConfigError: leads do not increase, or are not positive multiples of the step.
     """
     if isinstance(leads_h, str) or any(
         isinstance(h, bool) or not isinstance(h, int | float | np.number) for h in leads_h
@@ -313,7 +322,12 @@ def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
 
 
 def _distinct(*columns: I64) -> tuple[I64, I64]:
-    """First data center of each distinct combination of values, and the number of each one's."""
+    """Find data centers with equal values in all columns, (B,) each.
+
+    Returns:
+        Index of the first data center of each distinct combination of values, and for each data
+        center the index of its combination, (B,).
+    """
     _, first, which = np.unique(
         np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True
     )
@@ -321,7 +335,7 @@ def _distinct(*columns: I64) -> tuple[I64, I64]:
 
 
 def _relative_to_mean(series: FleetSeries) -> FleetSeries:
-    """Values of each series divided by their mean; a series of zeros stays."""
+    """Divide each series by its mean; series of zeros stay unchanged."""
     values = series.values.copy()
     for first, length in {*zip(series.offsets.tolist(), series.lengths.tolist(), strict=True)}:
         one = values[first : first + length]
@@ -331,6 +345,6 @@ def _relative_to_mean(series: FleetSeries) -> FleetSeries:
 
 
 def _sine_and_cosine(period: int) -> F32:
-    """Sine and cosine of each step of a period, (period, 2)."""
+    """Return sine and cosine of the phase of each step in a period, (period, 2)."""
     angle = 2.0 * np.pi * np.arange(period) / period
     return np.stack([np.sin(angle), np.cos(angle)], axis=1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Batches of data centers as one environment, without a Python object for each."""
+"""Vectorised environments: a batch of data centers in one object."""
 
 from __future__ import annotations
 
@@ -34,37 +34,39 @@ if TYPE_CHECKING:
 
     _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any]
 else:
-    _VectorWrapper = VectorWrapper  # Gymnasium 1.4 is the first in which it takes parameters.
+    _VectorWrapper = VectorWrapper  # Type parameters work at run time only from Gymnasium 1.4 on.
 
 Flags = npt.NDArray[np.bool_]
 
 
 class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
-    """Batch of data centers with one learner each, as made by ``gymnasium.make_vec``.
+    """Batch of data centers with one learner each, as created by ``gymnasium.make_vec``.
 
-    Its results equal those of Gymnasium's ``SyncVectorEnv`` of single environments. All episodes
-    have the same length and end, by truncation, in the same step. The next step starts new ones: it
-    ignores its actions and returns first observations, rewards of 0 and the infos of ``reset``.
+    Results equal those of Gymnasium's ``SyncVectorEnv`` of single environments. All episodes have
+    the same length and end, by truncation, in the same step. By default the next step starts new
+    episodes: it ignores its actions and returns the first observations, rewards of 0 and the infos
+    of ``reset``.
 
     Args:
         num_envs: number of environments.
-        config: a preset, a file, or configs; environment i takes config i modulo their number.
-        agent: agent that learns while ``others`` commands the rest; None is all ``agents`` as one.
-        registered_agent: set by the ids of one agent.
-        autoreset_mode: when the next episodes start, as the enum or its value: ``NextStep``, in the
-            step after the one that ends the last ones; ``SameStep``, in that step itself;
-            ``Disabled``, by ``reset`` alone.
-        max_episode_steps: ends episodes after fewer steps than their days have, as Gymnasium's
-            ``TimeLimit`` does around a single environment; None and -1 do not.
+        config: a preset, a file, or configs; environment i uses config i modulo their number.
+        agent: the only learning agent; the controller ``others`` commands the rest. With None one
+            learner controls all ``agents``.
+        registered_agent: agent of the Gymnasium id, if the id has a single agent.
+        autoreset_mode: start of the next episodes, as Gymnasium's enum or its value. ``NextStep``
+            means the step after the last step of an episode, ``SameStep`` the last step itself, and
+            ``Disabled`` only a call of ``reset``.
+        max_episode_steps: shorter length of episodes, in steps, as in Gymnasium's ``TimeLimit``;
+            None and -1 mean no such limit.
         arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
-            fields of ``EnvOptions``, as docs/environments.md lists them.
+            fields of ``EnvOptions``; see docs/environments.md.
 
     Raises:
-        SdcError: a config, number or option that is not valid.
+        SdcError: a config, number or option is not valid.
     """
 
     closed = True
-    """Whether the environment is closed, or its constructor has not finished.
+    """True if the environment is closed, or if its constructor has not finished.
 
     Gymnasium closes every environment on deletion, even one whose constructor failed.
     """
@@ -101,12 +103,14 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i; None continues the generator.
-            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
-                each environment; ``reset_mask`` of Gymnasium if it selects all.
+            seed: environment i uses ``seed + i``, or entry i of a sequence; None continues the
+                random generators.
+            options: dict with ``start_day``, a day as ``MM-DD`` or as number of the day in the
+                year, from 0, or one day for each environment. Gymnasium's ``reset_mask`` is valid
+                if it selects all environments.
 
         Raises:
-            ConfigError: a seed, option or day that is not valid.
+            ConfigError: a seed, option or day is not valid.
         """
         given: Any = dict(options) if isinstance(options, Mapping) else options
         mask = given.pop("reset_mask", None) if isinstance(given, dict) else None
@@ -120,15 +124,15 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._learner.observation(observations), self._infos(self.core.start_info())
 
     def step(self, actions: Any) -> tuple[Observation, F64, Flags, Flags, dict[str, Any]]:
-        """Advance all environments.
+        """Advance all environments by one step.
 
         Args:
-            actions: of ``action_space``.
+            actions: an element of ``action_space``.
 
         Raises:
-            SdcError: actions outside their space.
-            RuntimeStateError: before ``reset``, or after the end of the episodes if nothing else
-                starts the next ones.
+            SdcError: the actions are outside their space.
+            RuntimeStateError: the environment has not been reset, or its episodes are over in mode
+                ``Disabled``.
         """
         none = np.zeros(self.num_envs, dtype=np.bool_)
         if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
@@ -146,11 +150,11 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Features of an observation, in the order in which they stand side by side."""
+        """Features of an observation, in the order of its entries."""
         return self._learner.features
 
     def actions_of(self, commands: Actions) -> npt.NDArray[Any]:
-        """Actions of ``action_space`` that approximate commands most closely.
+        """Return the element of ``action_space`` that is nearest to commands.
 
         Args:
             commands: commands of one step, such as those of a controller for ``core.view``.
@@ -158,11 +162,11 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._learner.joined(self.core.actions_of(commands))
 
     def _infos(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Infos with Gymnasium's masks, which are true for all environments."""
+        """Add Gymnasium's masks to infos; the masks are true for all environments."""
         return {**values, **{f"_{name}": self._everyone for name in values}}
 
     def _one_by_one(self, observation: Observation) -> npt.NDArray[np.object_]:
-        """Observations as an array of objects, the form of Gymnasium's ``final_obs``."""
+        """Return observations as an array of objects, the form of Gymnasium's ``final_obs``."""
         out = np.empty(self.num_envs, dtype=object)
         for i, one in enumerate(iterate(self.observation_space, observation)):
             out[i] = one
@@ -180,27 +184,27 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._learner.observation(self.core.load_state_dict(values))
 
     def close(self, **_: Any) -> None:
-        """Close the simulator, which is unusable afterwards."""
+        """Close the simulator; the environment cannot be used afterwards."""
         if not self.closed:
             super().close()
             self.closed = True
 
 
 class RecordEpisodes(_VectorWrapper):
-    """Wrapper that records a vector environment of ``gymnasium.make_vec("sdc_taichi/...")``.
+    """Gymnasium wrapper that records a vector environment of this package.
 
-    ``RecordEpisodes(env, target, ...)`` does the same as ``make_vec`` with
+    ``RecordEpisodes(env, target, ...)`` has the same effect as ``make_vec`` with the argument
     ``recorder=EpisodeRecorder(target, ...)``. Closing the environment ends the recording.
 
     Args:
-        env: a batch of ``gymnasium.make_vec``, wrapped or not.
-        target: destination, as ``EpisodeRecorder.target``.
-        episode_trigger: choice of episodes, as ``EpisodeRecorder.episode_trigger``.
-        envs: choice of environments, as ``EpisodeRecorder.envs``.
-        every: steps between two heat maps, and between two frames of the 3D hall.
+        env: a batch from ``gymnasium.make_vec("sdc_taichi/...")``, wrapped or not.
+        target: destination of the recordings; see ``EpisodeRecorder.target``.
+        episode_trigger: choice of episodes; see ``EpisodeRecorder.episode_trigger``.
+        envs: choice of environments; see ``EpisodeRecorder.envs``.
+        every: number of steps between two heat maps, and between two frames of the 3D hall.
 
     Raises:
-        SdcError: an environment of another kind, or an argument that is not valid.
+        SdcError: ``env`` is another kind of environment, or an argument is not valid.
     """
 
     def __init__(
@@ -226,28 +230,30 @@ class RecordEpisodes(_VectorWrapper):
 class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
     """Batch of data centers with several learning agents each.
 
-    All episodes have the same length and end, by truncation, in the same step. The step after that
-    starts the next ones: it ignores its actions and returns first observations and rewards of 0.
+    All episodes have the same length and end, by truncation, in the same step. By default the next
+    step starts new episodes: it ignores its actions and returns the first observations and rewards
+    of 0.
 
     Args:
-        num_envs: number of environments; None is one per config.
-        config: a preset, a file, or configs; environment i takes config i modulo their number.
-        autoreset_mode: when the next episodes start, as Gymnasium's enum or its value:
-            ``NextStep``, in the step after the one that ends the last ones; ``SameStep``, in that
-            step itself; ``Disabled``, by ``reset`` alone.
+        num_envs: number of environments; None creates one per config.
+        config: a preset, a file, or configs; environment i uses config i modulo their number.
+        autoreset_mode: start of the next episodes, as Gymnasium's enum or its value. ``NextStep``
+            means the step after the last step of an episode, ``SameStep`` the last step itself, and
+            ``Disabled`` only a call of ``reset``.
         arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
-            fields of ``EnvOptions``, as docs/environments.md lists them.
+            fields of ``EnvOptions``; see docs/environments.md.
 
     Attributes:
         num_envs: number of environments, B.
-        possible_agents: the learning agents; ``agents`` is the same, as episodes follow each other.
-        observation_spaces: spaces of the observations of one environment, by agent.
-        action_spaces: spaces of the actions of one environment, by agent.
+        possible_agents: names of the learning agents. ``agents`` is always the same list, because
+            agents never leave an episode early.
+        observation_spaces: observation space of one environment, by agent.
+        action_spaces: action space of one environment, by agent.
         state_space: space of the shared state of one environment.
         metadata: name, render modes, and ``autoreset_mode`` as Gymnasium's enum.
 
     Raises:
-        SdcError: a config, number or option that is not valid.
+        SdcError: a config, number or option is not valid.
     """
 
     def __init__(
@@ -288,16 +294,17 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i; None continues the generator.
-            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
-                each environment.
+            seed: environment i uses ``seed + i``, or entry i of a sequence; None continues the
+                random generators.
+            options: dict with ``start_day``, a day as ``MM-DD`` or as number of the day in the
+                year, from 0, or one day for each environment.
 
         Returns:
-            Observations by agent, (B, n) each, and infos: ``start_day`` and what was drawn, (B,)
-            each.
+            Observations by agent, (B, n) each, and infos: ``start_day`` and the randomly drawn
+            inputs, (B,) each.
 
         Raises:
-            ConfigError: a seed, option or day that is not valid.
+            ConfigError: a seed, option or day is not valid.
         """
         observations = self.core.reset(seed, start_day_option(options))
         return observations, self.core.start_info()
@@ -307,23 +314,25 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
     ) -> tuple[
         dict[str, Observation], dict[str, F32], dict[str, Flags], dict[str, Flags], dict[str, Any]
     ]:
-        """Advance all environments, or start their next episodes as ``autoreset_mode`` says.
+        """Advance all environments by one step, or start their next episodes.
+
+        In mode ``SameStep`` the last step of the episodes also starts the next ones. It returns the
+        first observations of these, and adds ``final_obs`` (by agent), ``final_state`` and the new
+        ``start_day`` to the infos. In mode ``NextStep`` the step after the last one ignores its
+        actions. It returns observations and infos of ``reset``, and rewards of 0.
 
         Args:
-            actions: by agent, (B,) whole numbers, or (B, k) numbers with continuous actions or
-                several CRAC units.
+            actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
+                the agent decides k values; continuous actions are floats, (B, k).
 
         Returns:
-            Observations, rewards, terminations and truncations by agent, and infos. Infos have
-            every (B,) quantity of ``StepResult`` of this step and its costs by name. In mode
-            ``SameStep`` the step that ends episodes adds ``final_obs`` (by agent),
-            ``final_state``, and ``start_day`` of the next ones, to which the observations belong
-            then. In mode ``NextStep`` the step after it ignores its actions: observations and infos
-            are those of ``reset``, and rewards are 0.
+            Observations, rewards, terminations and truncations by agent, and infos. Infos contain
+            the (B,) quantities of the step's ``StepResult`` and the costs, by name.
 
         Raises:
-            SdcError: actions that are missing, too many, or outside their space.
-            RuntimeStateError: before ``reset``, or after the end of the episodes in mode
+            SdcError: the actions of an agent are missing or outside their space, or there are
+                actions of an agent that does not learn.
+            RuntimeStateError: the environment has not been reset, or its episodes are over in mode
                 ``Disabled``.
         """
         if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
@@ -351,7 +360,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         )
 
     def _flags(self, value: bool) -> dict[str, Flags]:
-        """One flag for all environments, (B,), by agent."""
+        """Return arrays that repeat one flag for all environments, (B,), by agent."""
         return {agent: np.full(self.num_envs, value) for agent in self.agents}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
