@@ -206,7 +206,7 @@ class Exogenous:
     demand: Annotated[F64, Quantity("1")]
     """Arriving work as a share of the data center's capacity, 0..1."""
     price_per_kwh: Annotated[F64, Quantity("currency/kWh")]
-    """Price of a kWh from the grid, in the currency of the tariff; 0 without a tariff."""
+    """Price of a kWh from the grid, in the currency of the tariff; 0 if no prices are given."""
 
 
 @dataclass
@@ -253,10 +253,10 @@ class WorkQuantities:
     due_tasks: Annotated[F64, Quantity("tasks")]
     """Queued work whose deadline has passed at the start of the step."""
     overdue_tasks: Annotated[F64, Quantity("tasks")]
-    """Due work that exceeds the capacity of the step and stays in the queue."""
+    """Due work that does not run because the capacity of the step is exhausted."""
     dropped_tasks: Annotated[F64, Quantity("tasks")]
-    """Work that could not be deferred because the queue was full; with workload model ``tasks`` it
-    runs at once and counts in ``executed_tasks``."""
+    """Work that exceeds the free space of the queue; with workload model ``tasks`` it runs at once
+    and counts in ``executed_tasks``."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""CRAC units: setpoints and fan speeds in a step, and whose air reaches which racks."""
+"""CRAC units: setpoints and fan speeds of a step, and each unit's share in the racks' supply."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from sdc_taichi.types import F64, I64, SetpointQuantities, State
 
 @dataclass
 class Supply(SetpointQuantities):
-    """How the CRAC units run during one step: B data centers, U units."""
+    """Operation of the CRAC units during one step: B data centers, U units."""
 
     coldest_supply_c: F64
-    """Coldest supply air of each unit, in C, (U,): its setpoint, less the design rise of the air
-    where that is of the return air."""
+    """Coldest supply temperature of each unit, in C, (U,): its setpoint; with control of the return
+    air, the setpoint minus the design temperature rise of the hall."""
     cooling_run: I64
-    """Equal cooling commands in a row that each unit has had, (U,)."""
+    """Number of consecutive equal cooling commands that each unit has received, (U,)."""
     cooling_last: F64
-    """Cooling command of each unit, in steps, (U,)."""
+    """Last cooling command of each unit, in setpoint steps, (U,)."""
     fan_speed: F64
-    """Controlled speed of each fan over full speed, (U,)."""
+    """Controlled speed of each fan as a share of full speed, (U,)."""
     unit_low: F64
-    """Lowest speed of each fan over full speed in this step, (U,)."""
+    """Minimum speed of each fan in this step, as a share of full speed, (U,)."""
     unit_high: F64
-    """Highest speed of each fan over full speed in this step, (U,)."""
+    """Maximum speed of each fan in this step, as a share of full speed, (U,)."""
     plant_setpoint_c: F64
-    """Coldest supply air, which the chilled water follows, in C, (B,)."""
+    """Coldest supply temperature of the running units, in C, (B,); it sets the temperature of the
+    chilled water."""
     coil_limit_w: F64
-    """Capacity of the coils of the units that run, in W, (B,)."""
+    """Total coil capacity of the running units, in W, (B,)."""
     coil_share: F64
-    """Airflow at full speed of the units that run over that of the design point, at most 1,
-    (B,)."""
+    """Full-speed airflow of the running units as a share of the design airflow, at most 1, (B,)."""
 
 
 class CracUnits:
@@ -48,7 +48,7 @@ class CracUnits:
 
     Args:
         fleet: B data centers with U CRAC units.
-        units: The units by data center.
+        units: Mapping between data centers and units.
     """
 
     def __init__(self, fleet: Fleet, units: UnitIndex) -> None:
@@ -81,7 +81,7 @@ class CracUnits:
         self._free_range = (self._min_speed, full_speed) if follows else at_design
 
     def initial_supply(self) -> Supply:
-        """Initial setpoints and fan speeds of units that all run, before any command."""
+        """Return initial setpoints and fan speeds before any command, with all units running."""
         n_units = len(self._initial_c)
         setpoint_c = self._initial_c.copy()
         low, high = self._free_range
@@ -100,16 +100,16 @@ class CracUnits:
         )
 
     def coldest_supply_c(self, unit_setpoint_c: F64) -> F64:
-        """Coldest supply air of each unit by its setpoint, each in C, (U,)."""
+        """Return the coldest supply temperature of each unit at a setpoint, both in C, (U,)."""
         return unit_setpoint_c - self._setpoint_over_supply_k
 
     def supply(self, state: State, commands: Commands, surroundings: Surroundings) -> Supply:
-        """Setpoints and fan speeds of a step.
+        """Compute setpoints and fan speeds of a step.
 
         Args:
             state: State at the start of the step.
-            commands: What to do with setpoints and fans.
-            surroundings: Which units run.
+            commands: Commands for setpoints and fans.
+            surroundings: Surroundings of the step, of which the running units are read.
         """
         unit_setpoint_c, cooling_run, cooling_last = self._setpoint_model(
             state.setpoint_c,
@@ -140,15 +140,16 @@ class CracUnits:
         )
 
     def _moved_fans(self, fan_speed: F64, command: F64 | None) -> F64:
-        """Speed of each fan after its command, (U,)."""
+        """Return the speed of each fan after its command, as a share of full speed, (U,)."""
         if command is None:
             return fan_speed
         return np.clip(fan_speed + command * self._fan_step, self._min_speed, 1.0)
 
     def _speed_range(self, fan_speed: F64, surroundings: Surroundings) -> tuple[F64, F64]:
-        """Speeds between which each fan follows the airflow of the servers, each (U,).
+        """Return minimum and maximum fan speeds, between which fans follow the server airflow.
 
-        Fans of units that are down coast at one speed.
+        Both have shape (U,) and are shares of full speed. Fans of units that are down coast at a
+        fixed speed.
         """
         low, high = self._free_range
         if self._controlled:
@@ -161,7 +162,10 @@ class CracUnits:
         return np.where(runs, low, self._coasting), np.where(runs, high, self._coasting)
 
     def _speed_that_holds_pressure(self, runs: npt.NDArray[np.bool_]) -> F64:
-        """Speed at which the units that run give the design airflow, at most full speed, (U,)."""
+        """Return the fan speed at which the running units supply the design airflow, (U,).
+
+        The speed is limited to the range from the minimum speed to full speed.
+        """
         coasting_m3s = self._units.sum(np.where(runs, 0.0, self._coasting * self._full_m3s))
         running_m3s = self._units.sum(np.where(runs, self._full_m3s, 0.0))
         speed = (self._design_m3s - coasting_m3s) / np.maximum(running_m3s, 1e-30)
@@ -170,11 +174,11 @@ class CracUnits:
     def _served_by_plant(
         self, coldest_supply_c: F64, surroundings: Surroundings
     ) -> tuple[F64, F64, F64]:
-        """What the plant sees of the coils in use, each (B,).
+        """Return the coil quantities that the cooling plant depends on, each (B,).
 
         Returns:
-            Coldest supply air, in C, which the chilled water follows, of the units that run, or
-            without any of all; capacity of the coils, in W; and their share of the airflow.
+            Coldest supply temperature of the running units, in C (of all units if none runs);
+            total coil capacity of the running units, in W; and ``Supply.coil_share``.
         """
         lowest_c = self._units.lowest(coldest_supply_c)
         if surroundings.all_running:
@@ -188,9 +192,10 @@ class CracUnits:
 
 
 def schedules_c(fleet: Fleet) -> FleetSeries | None:
-    """Scheduled setpoints over the steps of a year, in C; nan without a schedule.
+    """Return the scheduled setpoint of each data center over the steps of a year, in C.
 
-    None if no data center has one.
+    Data centers without a schedule have the value nan. The result is None if no data center has a
+    schedule.
     """
     hourly_c: dict[SetpointConfig, F64] = {}
     none_c = np.array([np.nan])
@@ -205,21 +210,22 @@ def schedules_c(fleet: Fleet) -> FleetSeries | None:
 
 
 _MOST_STORED = 4096
-"""Most sets of running units whose weights are stored."""
+"""Maximum number of sets of running units whose weights are cached."""
 
 
 class SharedPlenum:
-    """Shares of the CRAC units of a fleet in the supply of its racks, by the units that run.
+    """Keeps each CRAC unit's share in the racks' supply up to date when units stop or start.
 
-    They are computed where the set of running units of a data center changes, once for data centers
-    that are alike.
+    Shares are recomputed only for data centers whose set of running units changes, and the result
+    is cached for equal halls.
 
     Args:
-        fleet: Data centers; without recirculation there is nothing to keep up.
-        kernel_shares: The kernels' array of shares, which holds those of all units running.
-        first_share: First vector of each data center in it.
-        lanes: Racks in a vector.
-        adjusts_supply: The kernels' row of whether supply air may differ from setpoints, (B,).
+        fleet: Data centers; without recirculation, ``supply_from`` does nothing.
+        kernel_shares: Array of shares that the kernels read, initially for all units running.
+        first_share: First vector of each data center in ``kernel_shares``.
+        lanes: Number of racks in a vector.
+        adjusts_supply: Row of the kernels that is 1 if the supply temperature may differ from the
+            setpoint, (B,).
     """
 
     def __init__(
@@ -233,13 +239,17 @@ class SharedPlenum:
         self._adjusts_supply = adjusts_supply
         adjusts_supply[:] = self._always_adjusts
         self.weight = np.ones(fleet.units)
-        """Weight of each CRAC unit in the shares of all racks, (U,); 1 where all units run."""
+        """Weight of each CRAC unit in the shares of all racks, (U,); 1 while all units run."""
         self._whole = np.ones(fleet.units)
         self._running = self._whole
         self._weights_of_set: dict[tuple[int, bytes], F64] = {}
 
     def supply_from(self, running: F64 | None) -> None:
-        """Make the shares those of the units that run: 1 runs, 0 is down, (U,); None is all."""
+        """Update the shares for the running units.
+
+        Args:
+            running: 1 for running units, 0 for units that are down, (U,); None if all run.
+        """
         if running is None:
             running = self._whole
         if running is self._running or self._fleet.air is None:
@@ -270,7 +280,7 @@ class SharedPlenum:
         self._kernel_shares[first : first + len(by_block)] = by_block
 
     def _weights(self, dc: int, shares: F64, running: F64) -> F64:
-        """Weights of the units of a data center, (U,)."""
+        """Compute the supply weights of the units of a data center, (U,)."""
         fleet = self._fleet
         assert fleet.air is not None
         if running.all() or not running.any():
@@ -286,11 +296,11 @@ class SharedPlenum:
 
 
 def shares_by_block(shares: F64, lanes: int) -> Any:
-    """Shares as the kernels take them, one vector of racks per block and unit, (blocks U, lanes).
+    """Arrange shares for the kernels: one vector of racks per block and unit, (blocks * U, lanes).
 
     Args:
         shares: Share of each unit in the supply of each rack, (R, U).
-        lanes: Racks in a block; the last one is filled up with zeros.
+        lanes: Number of racks in a block; the last block is padded with zeros.
     """
     racks, units = shares.shape
     blocks = -(-racks // lanes)

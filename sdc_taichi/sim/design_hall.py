@@ -1,4 +1,4 @@
-"""A hall at its design point: places of racks and CRAC units, air, temperatures and indices."""
+"""Design point of a hall: floor plan, airflows, temperatures and air-management indices."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64
 
 EXACT_RADIUS_RACKS = 2000
-"""Number of racks up to which the spectral radius is computed; in larger halls the row sums bound
-it."""
+"""Largest number of racks for which the spectral radius is iterated; in larger halls the row sums
+of the recirculation matrix bound it."""
 _RADIUS_TOLERANCE = 1e-9
 _MOST_ITERATIONS = 1000
 _NO_APPROACH_K = 1e-9
 _ROUND_OFF_SHARE = 1e-9
-"""Share of air up to which none is left."""
+"""Bypass shares up to this value are round-off and count as 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class AirFlows:
-    """How air recirculates in a hall of R racks at its design point."""
+    """Air recirculation in a hall of R racks at its design point."""
 
     exhaust_share: F64
-    """Share of each rack's intake that is exhaust of the racks, r, dimensionless, (R,)."""
+    """Share r of each rack's intake air that is exhaust air of the racks, dimensionless, (R,)."""
     bypass_share: float
-    """Share of the CRAC air that no rack takes in, dimensionless."""
+    """Share of the CRAC air that bypasses the racks, dimensionless."""
     return_c: float
     """Temperature of the air that returns to the CRAC units, in C."""
     shi: float
@@ -49,9 +49,9 @@ class DesignHall:
     """A hall of R racks and U CRAC units at full load and design supply air."""
 
     config: DataCenterConfig
-    """The data center that the hall belongs to."""
+    """Configuration of the data center."""
     plan: FloorPlan
-    """Places of racks, aisles and walls."""
+    """Positions of racks, aisles and walls."""
     servers: int
     """Number of servers in the hall."""
     supply_c: float
@@ -61,7 +61,7 @@ class DesignHall:
     airflow_m3s: F64
     """Airflow through the servers of each rack, in m3/s, (R,)."""
     approach_k: F64
-    """Airflow-weighted mean inlet temperature of each rack above the supply air, in K, (R,)."""
+    """Airflow-weighted mean inlet temperature of each rack minus supply temperature, in K, (R,)."""
     inlet_c: F64
     """Airflow-weighted mean inlet temperature of each rack, in C, (R,)."""
     inlet_max_c: F64
@@ -73,23 +73,22 @@ class DesignHall:
     design_flow_m3s: float
     """Airflow of all CRAC units at the design point, in m3/s."""
     unit_places_m: F64
-    """Place of each CRAC unit on the floor plan, x and y in m, (U, 2)."""
+    """Position (x, y) of each CRAC unit on the floor plan, in m, (U, 2)."""
     hottest_rack: int
     """Index of the rack that holds the server with the hottest inlet."""
     hottest_server: int
-    """Number of the server with the hottest inlet, counted from the floor of its rack from 0."""
+    """Index of the server with the hottest inlet, counted from 0 at the floor of its rack."""
     air: AirFlows | None
-    """Recirculation in the hall; None with inlet model ``approach``, whose inlets follow from no
-    flows."""
+    """Air recirculation; None with inlet model ``approach``, which does not compute airflows."""
     inlets: Inlets
-    """Inlets of the racks as sums of parts."""
+    """Inlet temperatures of the racks, split into their causes."""
 
 
 def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     """Solve a hall at its design point with the kernels that the simulator runs, in f64.
 
     Raises:
-        SdcError: a hall that cannot be laid out or has no steady state.
+        SdcError: The hall cannot be laid out or has no steady state.
     """
     fleet = build_fleet(config)
     supply_c = config.hall.design_supply_c
@@ -100,7 +99,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     plan = floor_plan(config.hall)
     inlet_c = np.asarray(sums.rack_inlet_c, dtype=np.float64)
     approach_k = inlet_c - supply_c
-    # Round-off of either sign is no approach temperature.
+    # Approach temperatures within round-off of 0 are set to 0.
     approach_k[np.abs(approach_k) < _NO_APPROACH_K] = 0.0
     group = int(np.argmax(air_metrics.rank(hall.group_inlets())))
     rack = int(np.searchsorted(fleet.group_offsets, group, side="right")) - 1
@@ -131,7 +130,7 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
     if air is None:
         return None
     airflow_m3s = np.asarray(sums.rack_airflow_m3s, dtype=np.float64)
-    # A rack's inlet lies between supply air and the mix before it, by the share it takes of each.
+    # An inlet mixes supply air with the exhaust mix before the rack; solve for the exhaust share.
     mix_over_supply_k = air.mix_weights.apply(
         np.asarray(sums.rack_outlet_c - supply_c, dtype=np.float64)
     )
@@ -152,10 +151,11 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
 
 
 def _spectral_radius_bounds(weights: MixWeights, share: F64) -> tuple[float, float]:
-    """Bounds of the spectral radius of R = diag(share) w, which is not negative.
+    """Return lower and upper bound of the spectral radius of the matrix R = diag(share) w.
 
-    For any positive x it lies between the least and the largest (R x)_j / x_j (Collatz 1942,
-    Wielandt 1950); with x = 1 these are the row sums, and the power method brings them together.
+    R has no negative entries, so for any positive vector x the spectral radius is between the
+    smallest and the largest (R x)_j / x_j (Collatz 1942, Wielandt 1950). With x = 1 these bounds
+    are the extreme row sums; power iterations narrow them.
     """
     x, low, high = np.ones(len(share)), float(share.min()), float(share.max())
     if len(share) > EXACT_RADIUS_RACKS or low <= 0.0:
@@ -171,9 +171,9 @@ def _spectral_radius_bounds(weights: MixWeights, share: F64) -> tuple[float, flo
 
 
 def design_hall_values(solved: DesignHall) -> dict[str, Any]:
-    """A hall at its design point as plain values for JSON.
+    """Convert a hall at its design point to plain values for JSON.
 
-    Units are in the keys; lists per rack are in the order of the racks, row by row.
+    Keys name the units; lists per rack are in the order of the racks, row by row.
     """
     hall, air = solved.config.hall, solved.air
     flows: dict[str, Any] = {}

@@ -1,7 +1,7 @@
-"""Inputs of a fleet over time: weather, carbon intensity of the grid, and demand.
+"""Input time series of a fleet: weather, carbon intensity of the grid, demand and prices.
 
-Every series is brought to the time step once per site; a step reads one value per data center.
-Series may differ in length; each repeats from its own beginning.
+Every series is resampled to the time step once per site; a step reads one value per data center.
+Series may differ in length; each repeats from its beginning after its last value.
 """
 
 from __future__ import annotations
@@ -26,54 +26,56 @@ from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.types import F64, I64, Exogenous
 
 DESIGN_QUANTILE = 0.996
-"""Share of the year that a design temperature covers, the 0.4 % of ASHRAE design conditions."""
+"""Quantile of the year that defines a design temperature: exceeded in 0.4 % of the year, as for
+ASHRAE design conditions."""
 MAX_KEPT_BYTES = 2**28
-"""Most memory of series that are kept for later episodes, in bytes: some 900 synthetic years of a
-site and a trace."""
+"""Maximum memory of the cache of input series, in bytes: about 900 synthetic years of a site and a
+trace."""
 
 
 def common_digits(values: F64) -> bytes:
-    """Bytes of numbers rounded to f32: computed numbers differ in their last bits by processor."""
+    """Return the bytes of ``values`` rounded to f32.
+
+    The rounding hides differences in the last bits of f64 results between processors.
+    """
     with np.errstate(over="ignore", under="ignore"):
         return values.astype(np.float32).tobytes()
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSeries:
-    """One series over time for each data center, equal series stored once.
+    """One time series for each of B data centers; series that several share are stored once.
 
     Series may differ in length; each repeats after its last value.
     """
 
     values: F64
-    """All distinct series end to end, (T,)."""
+    """All distinct series, concatenated, (T,)."""
     offsets: I64
-    """Where in ``values`` the series of each data center begins, (B,)."""
+    """Index into ``values`` of the first value of each data center's series, (B,)."""
     lengths: I64
     """Number of values of each data center's series, (B,)."""
 
     def at(self, index: I64) -> F64:
-        """Values of every data center at steps of its series.
+        """Return the values of every data center at the given steps, in the shape of ``index``.
 
         Args:
-            index: a step of each data center, (B,), or several, (B, n); beyond the end of a series
-                it begins anew.
-
-        Returns:
-            Same shape.
+            index: One step of each data center, (B,), or several, (B, n); a step beyond the end of
+                a series continues from its beginning.
         """
         if index.ndim > 1:
             return self.values.take(self.offsets[:, None] + index % self.lengths[:, None])
         return self.values.take(self.places(index))
 
     def places(self, index: I64) -> I64:
-        """Where in ``values`` a step of each data center's series lies, (B,)."""
+        """Return the index into ``values`` of step ``index`` of each data center's series, (B,)."""
         return self.offsets + index % self.lengths
 
     def sharing_places(self, other: FleetSeries) -> FleetSeries:
-        """Copy that shares the offset and length arrays of ``other`` where they are equal.
+        """Return a copy that uses the offset and length arrays of ``other`` where they are equal.
 
-        Series that share both arrays are read at places that are computed once.
+        For series that share both arrays, ``Drivers.at`` computes the indices into ``values`` only
+        once.
         """
         offsets, lengths = (
             theirs if np.array_equal(mine, theirs) else mine
@@ -82,10 +84,10 @@ class FleetSeries:
         return FleetSeries(self.values, offsets, lengths)
 
     def take(self, where: Sequence[int]) -> FleetSeries:
-        """Series of some data centers, with no other values than theirs.
+        """Return the series of some data centers, without the values of the other data centers.
 
         Args:
-            where: their numbers, n; a number may stand more than once.
+            where: Indices of the data centers; an index may occur more than once.
         """
         chosen = list(where)
         first_places: dict[tuple[int, int], int] = {}
@@ -100,7 +102,7 @@ class FleetSeries:
         return FleetSeries(np.concatenate(pieces), np.array(offsets), self.lengths[chosen])
 
     def distinct(self) -> tuple[list[F64], I64]:
-        """The distinct series, and the number of the one that each data center reads, (B,)."""
+        """Return the list of distinct series, and each data center's index into it, (B,)."""
         parts, which = np.unique(
             np.stack([self.offsets, self.lengths], axis=1), axis=0, return_inverse=True
         )
@@ -109,7 +111,7 @@ class FleetSeries:
 
 @dataclass(frozen=True, slots=True)
 class Drivers:
-    """Weather, carbon intensity and demand of a fleet over time."""
+    """Input time series of a fleet of B data centers."""
 
     outdoor_c: FleetSeries
     """Outdoor dry-bulb temperature, in C."""
@@ -118,23 +120,24 @@ class Drivers:
     ci_g_per_kwh: FleetSeries
     """Carbon intensity of the grid, in g CO2e/kWh."""
     demand: FleetSeries
-    """Work that arrives in a step, as a share of the capacity, 0..1."""
+    """Arriving work of a step as a share of capacity, 0..1."""
     start: I64
     """First simulated step, counted from the beginning of the year, (B,)."""
     design_outdoor_c: F64
-    """Dry bulb of the design conditions of the weather file, else what the year exceeds for 0.4 %
-    of its steps, in C, (B,)."""
+    """Design dry bulb in C, (B,): that of the weather file, or else the dry bulb exceeded in 0.4 %
+    of the year."""
     design_wet_bulb_c: F64
-    """Wet bulb of the design conditions of the weather file, else what the year exceeds for 0.4 %
-    of its steps, in C, (B,)."""
+    """Design wet bulb in C, (B,): that of the weather file, or else the wet bulb exceeded in 0.4 %
+    of the year."""
     sources: tuple[dict[str, str], ...]
-    """Source of weather, carbon and workload of each data center; synthetic ones say so, B."""
+    """Text on the source of the weather, carbon and workload series, one dict per data center."""
     synthetic: tuple[bool, ...]
-    """Whether any series of a data center is synthetic, B."""
+    """True for each data center that has a synthetic series."""
     notes: tuple[str, ...]
-    """Repairs and warnings of the loaders, each text once."""
+    """Repairs and warnings of the loaders, without duplicates."""
     price_per_kwh: FleetSeries | None = None
-    """Price of a kWh from the grid; None takes the tariff of the config."""
+    """Price of a kWh from the grid, in the currency of the tariff; None uses the config's
+    tariff."""
 
     @property
     def size(self) -> int:
@@ -142,10 +145,10 @@ class Drivers:
         return len(self.start)
 
     def take(self, where: Sequence[int]) -> Drivers:
-        """Inputs of some data centers, with no other series than theirs.
+        """Return the inputs of some data centers, without the series of the other data centers.
 
         Args:
-            where: their numbers, n; a number may stand more than once.
+            where: Indices of the data centers; an index may occur more than once.
         """
         chosen, price = list(where), self.price_per_kwh
         first = self.outdoor_c.take(chosen)
@@ -164,10 +167,10 @@ class Drivers:
         )
 
     def digest(self) -> bytes:
-        """SHA-256 of all series; equal inputs have equal digests.
+        """Return the SHA-256 of all series.
 
-        Values that differ in the last bits, as on another processor, count as equal unless they
-        round apart.
+        Values are rounded to f32, so that inputs computed on different processors, which differ in
+        the last bits, normally have equal digests.
         """
         sha = hashlib.sha256()
         all_series = (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand)
@@ -178,7 +181,7 @@ class Drivers:
         return sha.digest()
 
     def at(self, step: int) -> Exogenous:
-        """Inputs of step ``step`` after reset."""
+        """Return the inputs of step ``step``, counted from 0 at reset."""
         index, first = self.start + step, self.outdoor_c
         places = first.places(index)
 
@@ -198,12 +201,12 @@ class Drivers:
 
 
 class InputReader:
-    """Reads the inputs of a fleet: those that its configs name, or other years and traces.
+    """Reads the inputs of a fleet as configured, or for other years and workload traces.
 
-    Inputs are cached up to ``MAX_KEPT_BYTES``; the least recently used go first.
+    Inputs are cached up to ``MAX_KEPT_BYTES``; the least recently used ones are evicted first.
 
     Args:
-        configs: data centers, B.
+        configs: Configs of B data centers.
     """
 
     def __init__(self, configs: Sequence[DataCenterConfig]) -> None:
@@ -214,26 +217,26 @@ class InputReader:
             for c in configs
         ]
         self._days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
-        self._kept: OrderedDict[_SiteKey | _TraceKey, SiteData | Series] = OrderedDict()
-        self._kept_bytes = 0
+        self._cache: OrderedDict[_SiteKey | _TraceKey, SiteData | Series] = OrderedDict()
+        self._cache_bytes = 0
         self._design_c: tuple[F64, F64] | None = None
 
     def read(
         self, years: Sequence[int] | None = None, traces: Sequence[str] | None = None
     ) -> Drivers:
-        """Inputs of the fleet on its time step.
+        """Read the inputs of the fleet and resample them to its time step.
 
-        Design temperatures are those of the years of the configs, whatever the years read: a data
-        center is sized once.
+        Design temperatures always come from the years of the configs, because a data center is
+        sized only once.
 
         Args:
-            years: seed of the synthetic series of each data center, B; None is ``site.seed``.
-            traces: name of the workload trace of each data center, or a file, which has a dot or a
-                slash, B; None is what the config names.
+            years: Seed of the synthetic series of each data center; None uses ``site.seed``.
+            traces: Workload trace of each data center, by name or file (see ``is_file``); None uses
+                the trace of the config.
 
         Raises:
-            ConfigError: an unknown site or trace.
-            DataError: a file that is not valid.
+            ConfigError: A site or trace is unknown.
+            DataError: A file is not valid.
         """
         site_keys, trace_keys = self._sites, self._traces
         if traces is not None:
@@ -283,24 +286,24 @@ class InputReader:
         )
 
     def is_synthetic(self) -> list[bool]:
-        """Whether any series of each data center is synthetic, so that years differ, B."""
+        """Return True for each data center with a synthetic series, which depends on the seed."""
         return [
             self._is_synthetic(site) or self._is_synthetic(trace)
             for site, trace in zip(self._sites, self._traces, strict=True)
         ]
 
     def check_trace(self, trace: str) -> Series:
-        """Read a workload trace by its name, or from a file, before an episode needs it.
+        """Read a workload trace by name or file, to find errors before an episode needs it.
 
         Raises:
-            DataError: an unknown name, or a file that is not valid.
+            DataError: The name is unknown or the file is not valid.
         """
         return self._trace(
             _trace_key(trace, self._sites[0].seed, trace if is_file(trace) else None)
         )
 
     def _of_years(self, keys: Sequence[_Key], years: Sequence[int]) -> list[_Key]:
-        """Keys of other years; measured series have one alone."""
+        """Replace the seed of each synthetic key; measured series do not depend on a seed."""
         synthetic = {key: self._is_synthetic(key) for key in dict.fromkeys(keys)}
         return [
             key._replace(seed=int(year)) if synthetic[key] else key
@@ -313,7 +316,7 @@ class InputReader:
         return _site_is_synthetic(self._site(key))
 
     def _design_temperatures(self, of_sites: Mapping[_SiteKey, _SiteArrays]) -> tuple[F64, F64]:
-        """Design dry bulb and wet bulb of the years that the configs name, in C, (B,) each."""
+        """Return design dry bulb and wet bulb for the years of the configs, in C, (B,) each."""
         design = {}
         for key in dict.fromkeys(self._sites):
             station = self._site(key).design
@@ -329,46 +332,46 @@ class InputReader:
         return outdoor_c.copy(), wet_bulb_c.copy()
 
     def _site(self, key: _SiteKey) -> SiteData:
-        found: Any = self._kept_or_read(key, _read_site)
-        return found  # type: ignore[no-any-return]
+        site: Any = self._cached(key, _read_site)
+        return site  # type: ignore[no-any-return]
 
     def _trace(self, key: _TraceKey) -> Series:
-        found: Any = self._kept_or_read(key, _read_trace)
-        return found  # type: ignore[no-any-return]
+        trace: Any = self._cached(key, _read_trace)
+        return trace  # type: ignore[no-any-return]
 
-    def _kept_or_read(
+    def _cached(
         self, key: _SiteKey | _TraceKey, read: Callable[[Any], SiteData | Series]
     ) -> SiteData | Series:
-        if key not in self._kept:
-            self._kept[key] = read(key)
-            self._kept_bytes += _size_bytes(self._kept[key])
-            while self._kept_bytes > MAX_KEPT_BYTES and len(self._kept) > 1:
-                self._kept_bytes -= _size_bytes(self._kept.popitem(last=False)[1])
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = read(key)
+            self._cache_bytes += _size_bytes(self._cache[key])
+            while self._cache_bytes > MAX_KEPT_BYTES and len(self._cache) > 1:
+                self._cache_bytes -= _size_bytes(self._cache.popitem(last=False)[1])
+        self._cache.move_to_end(key)
+        return self._cache[key]
 
     def _site_arrays(self, key: _SiteKey, site: SiteData) -> _SiteArrays:
         outdoor_c = resample(site.outdoor_c, self._steps_per_hour)
         wet_bulb_c = resample(site.wet_bulb_c, self._steps_per_hour)
         ci_g_per_kwh = resample(site.ci_g_per_kwh, self._steps_per_hour)
         if key.carbon_pairing == "utc_rows" and key.carbon_file is None:
-            # Local hour k gets the row of UTC hour k; files come with that pairing already.
+            # Local hour k gets the row of UTC hour k; carbon files have been paired by the loader.
             ci_g_per_kwh = np.roll(ci_g_per_kwh, -round(site.utc_offset_h * self._steps_per_hour))
         return _SiteArrays(outdoor_c, wet_bulb_c, ci_g_per_kwh)
 
 
 def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
-    """Read or generate the inputs that the site and workload sections name.
+    """Read or generate the inputs that the ``site`` and ``workload`` sections of configs name.
 
     Raises:
-        ConfigError: an unknown site or trace.
-        DataError: a file that is not valid.
+        ConfigError: A site or trace is unknown.
+        DataError: A file is not valid.
     """
     return InputReader(configs).read()
 
 
 def is_file(trace: str) -> bool:
-    """Whether a workload trace is named by its file, which has a dot or a slash, unlike a name."""
+    """Return True if ``trace`` is a file path, which contains a dot or a slash, not a name."""
     return "." in trace or "/" in trace or os.sep in trace
 
 
@@ -381,18 +384,18 @@ def drivers_from_arrays(
     size: int = 1,
     source: str = "arrays",
 ) -> Drivers:
-    """Inputs as arrays at the simulation's time step; the first value is that of step 0.
+    """Create inputs from arrays at the simulation's time step, whose first value is that of step 0.
 
     Args:
-        outdoor_c: dry bulb, -90..60 C, (T,) for all data centers or (B, T).
-        wet_bulb_c: wet bulb, not above the dry bulb, in C, (T,) or (B, T).
-        ci_g_per_kwh: carbon intensity, 0..2,000 g CO2e/kWh, (T,) or (B, T).
-        demand: arriving work as a share of the capacity, 0..1, (T,) or (B, T).
-        size: number of data centers for arrays of shape (T,).
-        source: text for the provenance.
+        outdoor_c: Outdoor dry bulb, -90..60 C, (T,) for all data centers or (B, T).
+        wet_bulb_c: Outdoor wet bulb, not above the dry bulb, in C, (T,) or (B, T).
+        ci_g_per_kwh: Carbon intensity, 0..2,000 g CO2e/kWh, (T,) or (B, T).
+        demand: Arriving work as a share of capacity, 0..1, (T,) or (B, T).
+        size: Number of data centers for arrays of shape (T,).
+        source: Text on the source of the data, for ``Drivers.sources``.
 
     Raises:
-        DataError: shapes that differ, or values that are not finite or out of range.
+        DataError: Shapes differ, or values are not finite or out of range.
     """
     arrays = {
         "outdoor_c": outdoor_c,
@@ -440,36 +443,36 @@ def drivers_from_arrays(
 
 
 class _SiteKey(NamedTuple):
-    """Settings that decide weather and carbon intensity of a data center."""
+    """Settings that determine the weather and carbon series of a data center."""
 
     location: str
     """Name of the site."""
     seed: int
     """Seed of the synthetic year."""
     weather_file: str | None
-    """File in place of the weather of the site; None is no file."""
+    """Weather file; None uses the built-in weather of the site."""
     carbon_file: str | None
-    """File in place of the carbon intensity of the site; None is no file."""
+    """Carbon-intensity file; None uses the built-in series of the site."""
     carbon_pairing: Pairing
-    """How carbon intensity meets weather in time."""
+    """Rule that aligns the carbon series with the weather in time."""
 
 
 class _TraceKey(NamedTuple):
-    """Settings that decide the arriving work of a data center."""
+    """Settings that determine the series of arriving work of a data center."""
 
     name: str
-    """Name of the trace, or its file."""
+    """Name of the trace, or its file path."""
     seed: int
     """Seed of the synthetic year."""
     file: str | None
-    """File of the trace; None is no file."""
+    """File path of the trace; None for a built-in trace."""
 
 
 _Key = TypeVar("_Key", _SiteKey, _TraceKey)
 
 
 class _SiteArrays(NamedTuple):
-    """Weather and carbon intensity of one site at the time step of the simulation, each (T,)."""
+    """Weather and carbon series of one site, resampled to the simulation's time step, (T,) each."""
 
     outdoor_c: F64
     """Outdoor dry-bulb temperature, in C, (T,)."""
@@ -487,12 +490,12 @@ def _site_key(config: DataCenterConfig) -> _SiteKey:
 
 
 def _trace_key(name: str, seed: int, file: str | None) -> _TraceKey:
-    """Key of a trace; a file is the same whatever the seed, and is read once."""
+    """Return the key of a trace; the key of a file has seed 0, because a file has no seed."""
     return _TraceKey(name, seed if file is None else 0, file)
 
 
 def _read_site(key: _SiteKey) -> SiteData:
-    """Weather and carbon intensity, without the series that no step reads."""
+    """Read weather and carbon intensity, and drop the series that the simulation does not read."""
     base = load_site(key.location, seed=key.seed)
     data = site_from_files(
         base, weather=key.weather_file, carbon=key.carbon_file, pairing=key.carbon_pairing
@@ -520,7 +523,7 @@ def _notes(site: SiteData, trace: Series) -> tuple[str, ...]:
 
 
 def fleet_series(series: Sequence[F64]) -> FleetSeries:
-    """Join one series per data center; the very same array is stored once."""
+    """Concatenate one series per data center; the same array object is stored only once."""
     offset_of: dict[int, int] = {}
     stored: list[F64] = []
     total = 0

@@ -1,8 +1,8 @@
-"""Failures and weather that a run meets: the events of each config as arrays per step.
+"""Events of a run: failures, outages and heat waves of each config, as arrays per step.
 
-An event covers every step that it has any part in: from the step in which it starts to the one in
-which it ends. One that is shorter than a step, or out of line with the steps, thus counts longer
-than it lasts, by one step on average.
+An event covers every step that it overlaps, from the step in which it starts to the step in which
+it ends. An event whose limits are not step boundaries is thereby extended to whole steps, by one
+step on average.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64, I64
 
 HOURS_PER_BLOCK = 8760
-"""Sampled events are drawn in blocks of 365 days, each from a stream of its own."""
-_HOURS_PER_WINDOW = 120  # Divides a block. Events are looked up once per window.
+"""Length of the blocks of sampled events, in h (365 days); each block has its own random stream."""
+_HOURS_PER_WINDOW = 120
+"""Length of the windows in which events are looked up together, in h; it divides a block."""
 _KINDS: tuple[EventKind, ...] = get_args(EventKind)
 _PLANT_SHARES: dict[str, tuple[EventKind, ...]] = {
     "chiller_share": ("chiller_derate",),
     "pump_share": ("pump_down",),
     "outdoor_units": ("tower_cell_down", "dry_cooler_down", "outdoor_air_closed"),
 }
-"""Kinds of events that leave a share of devices of the plant, by the field of ``Disturbance``."""
+"""Event kinds that reduce each share of plant devices, by the field of ``Disturbance``."""
 _KINDS_WITH_SHARE = {"rack_fan_failure"}.union(*_PLANT_SHARES.values())
 _NO_TARGET = -1
-"""Target of events of all CRAC units, or of none to name."""
+"""Target index of events that affect all CRAC units, or that have no target."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -42,24 +43,23 @@ class Disturbance:
     """Effects of events on one step, as read-only arrays: U CRAC units, R racks, B data centers."""
 
     active: bool
-    """Whether any event covers the step; without one, all is as if there were no events."""
+    """True if any event covers the step; otherwise all other fields have their normal values."""
     active_events: F64
     """Number of events that cover the step, (B,)."""
     unit_up: Mask
-    """Whether each CRAC unit is in order, (U,)."""
+    """True for each CRAC unit that has not failed, (U,)."""
     chiller_share: F64
     """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
     rack_airflow: F64
-    """Airflow of each rack that remains, as a share of its full airflow, 0..1, (R,)."""
+    """Remaining airflow of each rack's fans as a share of their full airflow, 0..1, (R,)."""
     outdoor_offset_k: F64
-    """Offset of dry bulb and wet bulb alike, so that their order is kept, in K, (B,)."""
+    """Offset that heat waves add to both dry bulb and wet bulb, in K, (B,)."""
     grid_up: Mask
-    """Whether the grid supplies the data center, (B,)."""
+    """True for each data center that the grid supplies, (B,)."""
     pump_share: F64
-    """Chilled-water pumps that are in order, as a share of all, 0..1, (B,)."""
+    """Share of the chilled-water pumps that work, 0..1, (B,)."""
     outdoor_units: F64
-    """Tower cells, dry coolers or openings for outdoor air in order, as a share of all, 0..1,
-    (B,)."""
+    """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +67,14 @@ class ActiveEvent:
     """One event that covers a step."""
 
     kind: EventKind
-    """Kind of event, as in ``events`` of the config."""
+    """Kind of event, as in section ``events`` of the config."""
     dc: int
-    """Data center that meets the event, counted from 0."""
+    """Index of the affected data center, counted from 0."""
     target: int | None
-    """CRAC unit or rack, counted within its data center; None is all of them, or none to name."""
+    """Index of the affected CRAC unit or rack within its data center; None if the event affects
+    all units or has no target."""
     share: float | None
-    """Share of capacity or airflow that remains, 0..1; None for kinds without a share."""
+    """Remaining share of capacity or airflow, 0..1; None for kinds without a share."""
     offset_k: float | None
     """Addition to the outdoor temperatures, in K; None for kinds without an offset."""
     start_step: int
@@ -84,45 +85,49 @@ class ActiveEvent:
 
 @dataclass(frozen=True, slots=True)
 class _Events:
-    """E events, one entry each; those of a data center keep their order in any fleet."""
+    """Arrays of E events.
+
+    The events of a data center have the same order in every fleet.
+    """
 
     kind: I64
-    """Place of the kind in ``_KINDS``, (E,)."""
+    """Index of the event kind in ``_KINDS``, (E,)."""
     dc: I64
-    """Data center, counted from 0, (E,)."""
+    """Index of the data center, counted from 0, (E,)."""
     target: I64
-    """CRAC unit or rack within the data center, -1 for all of them or none to name, (E,)."""
+    """Index of the CRAC unit or rack within the data center, (E,); -1 for all units or no
+    target."""
     value: F64
-    """Share left, 0..1, or temperature offset, in K; nan for kinds without either, (E,)."""
+    """Remaining share, 0..1, or temperature offset, in K, (E,); nan for kinds without either."""
     first_step: I64
     """First step since reset that the event covers, (E,)."""
     end_step: I64
     """First step since reset after the event, (E,)."""
 
     def where(self, mask: Mask) -> _Events:
-        """Events of a mask, (E,), in their order."""
+        """Return the events for which ``mask``, (E,), is True, in their order."""
         return _Events(*(getattr(self, f.name)[mask] for f in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Events of one data center that are sampled from one distribution."""
+    """Rule that samples random events of one data center from one distribution."""
 
     dc: int
-    """Data center, counted from 0."""
+    """Index of the data center, counted from 0."""
     key: tuple[int, int]
     """Key of the random stream: CRC-32 of the data center's name, and the index of the rule."""
     targets: int
-    """CRAC units or racks to draw from; 0 for kinds without a target."""
+    """Number of CRAC units or racks to draw a target from; 0 for kinds without a target."""
     event: SampledEvent
     """Rate, duration and effect, as in the config."""
 
 
 class Timeline:
-    """Events of a fleet, step by step; made by ``schedule``.
+    """Events of a fleet by step, created by ``schedule``.
 
-    What a step meets depends on the configs, the seed and the step alone, not on what was asked
-    before, so a snapshot needs to hold nothing but the seed.
+    The events of a step depend only on configs, seed and step, not on earlier calls. A snapshot of
+    the simulator therefore stores only the seed.
     """
 
     def __init__(
@@ -161,11 +166,11 @@ class Timeline:
 
     @property
     def event_free(self) -> bool:
-        """Whether no event can ever happen."""
+        """True if no event can ever occur."""
         return not self._rules and not len(self._scheduled.kind)
 
     def reseeded(self, seed: I64 | int) -> Timeline:
-        """Timeline whose sampled events are drawn with other seeds, (B,) or one for all."""
+        """Return a timeline whose sampled events use other seeds, (B,) or one for all."""
         if not self._rules:
             return self
         return Timeline(
@@ -178,7 +183,10 @@ class Timeline:
         )
 
     def at(self, step: int) -> Disturbance:
-        """Effects of events on step ``step`` after reset; a shared object while there are none."""
+        """Return the effects of events on step ``step``, counted from 0 at reset.
+
+        Steps without events share one object.
+        """
         events = self._covering(step)
         if not len(events.kind):
             return self._normal
@@ -216,7 +224,7 @@ class Timeline:
         )
 
     def active(self, step: int) -> list[ActiveEvent]:
-        """Events that cover step ``step``, by data center and start."""
+        """Return the events that cover step ``step``, sorted by data center, then by start."""
         events = self._covering(step)
         out = []
         for i in np.lexsort((events.first_step, events.dc)):
@@ -247,7 +255,7 @@ class Timeline:
         return events.where((events.first_step <= step) & (step < events.end_step))
 
     def _overlapping(self, low: int, high: int) -> _Events:
-        """Events that cover any of the steps low..high-1, which lie in one block."""
+        """Return events that cover any of the steps low..high-1, all of which are in one block."""
         listed = [self._scheduled]
         if self._rules:
             last = low // (HOURS_PER_BLOCK * self._steps_per_hour)
@@ -264,7 +272,7 @@ class Timeline:
         return _concatenated([self._sampled_by_rule(rule, block) for rule in self._rules])
 
     def _sampled_by_rule(self, rule: _Rule, block: int) -> _Events:
-        """Events of one rule that start in one block of 365 days."""
+        """Sample the events of one rule that start in one block of 365 days."""
         sequence = np.random.SeedSequence([int(self._seed[rule.dc]), *rule.key, block])
         rng = np.random.Generator(np.random.PCG64(sequence))
         event = rule.event
@@ -285,19 +293,19 @@ def schedule(
     steps_per_hour: int,
     seed: I64 | int,
 ) -> Timeline:
-    """Events of a fleet.
+    """Create the timeline of scheduled and sampled events of a fleet.
 
-    Sampled events are a Poisson process per rule, with durations, units and racks drawn evenly.
-    Each rule of each data center draws from its own random stream, by seed, name and rule, so a
-    data center meets the same events alone and in a fleet. None started before step 0. Where events
-    overlap, shares multiply, offsets add, and a unit is down as long as any of them has it down.
+    Each sampling rule is a Poisson process with uniformly distributed durations, units and racks.
+    Its random stream depends only on the seed, the data center's name and the rule, so a data
+    center has the same events alone and in a fleet. No event starts before step 0. If events
+    overlap, shares multiply, offsets add, and a unit is down while any event has it down.
 
     Args:
-        configs: data centers, B of them.
-        rack_offsets: first rack of each data center and their total, (B + 1,).
-        unit_offsets: first CRAC unit of each data center and their total, (B + 1,).
-        steps_per_hour: steps per hour.
-        seed: decides the sampled events, at least 0, (B,) or one for all.
+        configs: Configs of B data centers.
+        rack_offsets: First rack of each data center, and the total, (B + 1,).
+        unit_offsets: First CRAC unit of each data center, and the total, (B + 1,).
+        steps_per_hour: Number of steps in an hour.
+        seed: Seed of the sampled events, at least 0, (B,) or one for all.
     """
     racks, units = np.diff(rack_offsets), np.diff(unit_offsets)
     listed, rules = [_EMPTY], []
@@ -329,22 +337,23 @@ def schedule(
 
 
 def seeds_of_fleet(seed: int, names: Sequence[str]) -> I64:
-    """Seeds of the data centers of a fleet, of which no two meet the same events, (B,).
+    """Return an event seed for each data center such that no two have the same events, (B,).
 
-    The first data center of each name takes the seed itself, as one alone does. Copies, which share
-    its name, take numbers of NumPy's ``SeedSequence(seed)`` in turn, so that their seeds are not
-    those of runs with seeds close by.
+    The first data center of each name gets ``seed`` itself, as in a run alone. Further data centers
+    with the same name get successive numbers of NumPy's ``SeedSequence(seed)``, so that their
+    seeds do not collide with those of runs with neighbouring seeds.
 
     Args:
-        seed: seed of the run, 0..2**63 - 1.
-        names: names of the data centers, B of them.
+        seed: Seed of the run, 0..2**63 - 1.
+        names: Names of the B data centers.
     """
     seen = Counter[str]()
     copies = []
     for name in names:
         copies.append(seen[name])
         seen[name] += 1
-    # A sequence of any length starts with the same numbers; halved, they are valid seeds.
+    # The k-th number of a seed sequence does not depend on its length. The shift by one bit makes
+    # the numbers valid int64 seeds.
     drawn = np.random.SeedSequence(seed).generate_state(max(copies), np.uint64) >> 1
     return np.concatenate([[seed], drawn.astype(np.int64)])[copies]
 
@@ -352,15 +361,15 @@ def seeds_of_fleet(seed: int, names: Sequence[str]) -> I64:
 def require_events_start_before(
     end_h: float, configs: Sequence[DataCenterConfig], what: str = "the run"
 ) -> None:
-    """Make sure that every scheduled event starts before a run ends.
+    """Check that every scheduled event starts before the end of a run.
 
     Args:
-        end_h: length of the run, in h.
-        configs: data centers.
-        what: name of the run, for the message.
+        end_h: Length of the run, in h.
+        configs: Configs of the data centers.
+        what: Name of the run, for the error message.
 
     Raises:
-        ConfigError: naming data center and event.
+        ConfigError: An event starts at or after the end; the message names the event.
     """
     for config in configs:
         for index, event in enumerate(config.events.scheduled):
@@ -380,7 +389,7 @@ def _events(
     *,
     steps_per_hour: int,
 ) -> _Events:
-    # The tolerance keeps a step boundary that is no exact binary number a boundary.
+    # The tolerance absorbs round-off in times that are meant to be step boundaries.
     start = np.floor(start_h * steps_per_hour + 1e-9)
     end = np.ceil((start_h + duration_h) * steps_per_hour - 1e-9)
     value = event.share if event.share is not None else event.offset_k

@@ -1,7 +1,7 @@
-"""From the air of the halls to the grid: CRAC units, plant, water, battery, carbon and indices.
+"""Facility model: CRAC units, cooling plant, water, battery, grid, carbon and air indices.
 
-One pass over B data centers, plain NumPy, which a step runs compiled. Quantities have the names of
-``StepResult`` on the way.
+The model is plain NumPy code over B data centers, which ``FacilityStage`` compiles. Intermediate
+quantities have the names that they have in ``StepResult``.
 """
 
 from __future__ import annotations
@@ -48,32 +48,32 @@ from sdc_taichi.types import (
 
 @dataclass(frozen=True, slots=True)
 class StepInputs:
-    """What a step of the facility starts from: the results of the stages before it."""
+    """Inputs of the facility in one step: the results of the preceding stages."""
 
     state: State
-    """State at the start of the step: energy in the battery, heat held by the room."""
+    """State at the start of the step, of which battery energy and room heat are read."""
     commands: Commands
-    """What the battery is to do."""
+    """Commands of the step, of which the battery command is read."""
     surroundings: Surroundings
-    """Weather, carbon intensity, price, grid, and what is out of order."""
+    """Weather, carbon intensity, price, grid and failures."""
     supply: Supply
-    """How the CRAC units run."""
+    """Operation of the CRAC units."""
     air: HallSums
-    """Air, temperatures and power of the halls."""
+    """Airflows, temperatures and power of the halls."""
 
 
 def battery_parameters(fleet: Fleet) -> BatteryParameters:
-    """Parameters of the batteries of a fleet, (B,) each."""
+    """Return the battery parameters of a fleet, (B,) each."""
     return BatteryParameters(*(fleet.values(f"battery.{n}") for n in BatteryParameters._fields))
 
 
 class Facility:
-    """Models and sized devices of a fleet, behind its halls.
+    """Models and sized devices of a fleet, except the halls.
 
     Args:
         fleet: B data centers.
         sizing: Their sized devices.
-        event_free: Whether no event can ever happen: all is in order and has power.
+        event_free: True if no event can ever occur, so that all devices work and have power.
     """
 
     def __init__(self, fleet: Fleet, sizing: Sizing, *, event_free: bool) -> None:
@@ -101,8 +101,9 @@ class Facility:
         self._grid_limit_kw = sizing.grid_limit_kw if limited else None
         self._outage_battery = self._battery
         if self._battery_model.by_rate_of_store:
-            # At 1 C a battery of one hour carries the design power: its losses are less than what
-            # the design power exceeds any load by.
+            # The discharge limit is relaxed by the loss factor, so that a one-hour battery at 1 C
+            # delivers the design power. The error is small: the design power exceeds any load by
+            # more than the losses.
             rate = self._battery.discharge_limit_c_rate * self._battery.discharge_factor
             self._outage_battery = self._battery._replace(discharge_limit_c_rate=rate)
         self._water = {
@@ -122,11 +123,14 @@ class Facility:
         self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
 
     def removable_w(self, surroundings: Surroundings, supply: Supply) -> dict[str, F64]:
-        """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,).
+        """Compute the heat that the plant can remove with the coils in use.
 
         Args:
-            surroundings: Weather, and what is out of order.
-            supply: How the CRAC units run.
+            surroundings: Weather and failures.
+            supply: Operation of the CRAC units.
+
+        Returns:
+            ``heat_removed_w``, in W, (B,), as the only entry.
         """
         capacity_w = self._coil_capacity_w(surroundings, supply)
         flow_m3s = self._sizing.crac_flow_m3s
@@ -136,13 +140,13 @@ class Facility:
         return {"heat_removed_w": plant.heat_removed_w}
 
     def step(self, inputs: StepInputs) -> dict[str, F64]:
-        """Everything that follows from the air of the halls.
+        """Compute CRAC, plant, water, energy and index quantities of a step.
 
         Args:
-            inputs: What the step starts from.
+            inputs: Results of the preceding stages.
 
         Returns:
-            Quantities of ``StepResult`` by their names there, each (B,).
+            Quantities of ``StepResult`` by their field names, each (B,).
         """
         it_w = inputs.air.cpu_w + inputs.air.it_fan_w
         air = self._crac_air(inputs, it_w)
@@ -158,19 +162,19 @@ class Facility:
         energy = self._energy(inputs, it_w, self._hvac_w(air, plant))
         indices = self._air_indices(inputs.air, air.return_c)
         results = joined(*map(fields_of, (air, plant, heat, water, indices)), energy)
-        # The plant's flows of water and air are no results.
+        # Internal quantities of the plant, such as its water and airflows, are not reported.
         return {name: values for name, values in results.items() if name in QUANTITIES}
 
     def powered_share(self, grid_up: npt.NDArray[np.bool_], stored_kwh: F64) -> F64:
-        """Share of a step with power, 0..1, (B,).
+        """Return the share of a step during which each data center has power, 0..1, (B,).
 
-        In an outage power lasts as long as the battery would carry the facility at its design
-        power, which is more than it draws; a battery that cannot deliver the design power carries
-        it for a part of the time.
+        In an outage, power lasts as long as the battery could supply the facility at its design
+        power, a conservative estimate because the actual load is lower. A battery with too small a
+        power limit supplies the design power for a correspondingly shorter time.
 
         Args:
-            grid_up: Whether the grid supplies, (B,).
-            stored_kwh: Energy in the batteries at the start of the step, kWh, (B,).
+            grid_up: True for data centers that the grid supplies, (B,).
+            stored_kwh: Energy in the batteries at the start of the step, in kWh, (B,).
         """
         all_step = np.ones(len(stored_kwh))
         if np.all(grid_up):
@@ -183,7 +187,7 @@ class Facility:
         return np.where(grid_up, all_step, lasts)
 
     def _crac_air(self, inputs: StepInputs, it_w: F64) -> CracQuantities:
-        """Airflow, supply and return air, fans and heat of the CRAC units."""
+        """Compute airflow, fan power, return temperature and cooling load of the CRAC units."""
         if self._recirculates:
             fan_w = self._while_powered(
                 self._fan_w_per_m3s * inputs.air.cubed_flow_m3s, inputs.surroundings
@@ -224,7 +228,7 @@ class Facility:
         )
 
     def _requested_w(self, inputs: StepInputs, air: CracQuantities) -> F64:
-        """Heat that the CRAC units ask the plant to take: load, and heat held by the room."""
+        """Return the heat requested from the plant, in W: cooling load plus stored room heat."""
         if self._transient:
             return inputs.air.coil_w
         wanted_w = air.cooling_load_w + inputs.state.room_heat_kwh * 1e3 / self._step_h
@@ -246,7 +250,7 @@ class Facility:
         return_c: F64,
         airflow_m3s: F64,
     ) -> WaterSideResult:
-        """The plant, which stands still while there is no power."""
+        """Operate the cooling plant, which is off during the share of the step without power."""
         design = self._sizing.water_side
         if not self._event_free:
             on = np.where(surroundings.powered > 0, surroundings.powered, 1.0)
@@ -270,10 +274,11 @@ class Facility:
     def _balance_heat(
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
     ) -> RoomQuantities:
-        """Heat that was not removed stays in the room; spare capacity fetches it later."""
+        """Balance the room: unremoved heat is stored, and spare capacity removes it later."""
         load_w, removed_w = air.cooling_load_w, plant.heat_removed_w
         if self._transient:
-            # The room has kept its heat within the step; here is what the plant fell short of.
+            # The hall kernel has balanced the room with ``coil_w``; add the heat that the plant
+            # did not remove after all.
             short_kwh = (inputs.air.coil_w - removed_w) * self._step_h / 1e3
             room_heat_kwh = inputs.air.room_j / 3.6e6 + short_kwh
             unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, removed_w)
@@ -282,14 +287,14 @@ class Facility:
                 load_w, removed_w, inputs.state.room_heat_kwh, self._step_h
             )
         if not self._stores_heat:
-            # Of no sign, even where the load is negative.
+            # Adding 0.0 turns a negative zero into 0.
             unmet_w = recovered_w = 0.0 * load_w + 0.0
         return RoomQuantities(unmet_w, recovered_w, room_heat_kwh)
 
     def _use_water(
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
     ) -> WaterQuantities:
-        """Water that the tower evaporates, loses and gets; else that of the humidifier."""
+        """Compute the water consumption of the tower, or of the humidifier of a dry plant."""
         if self._plant.dry:
             nothing = 0.0 * plant.rejected_w
             evaporation_l = plant.humidifier_kg_s * (self._step_h * 3600.0)
@@ -311,13 +316,13 @@ class Facility:
         )
 
     def _hvac_w(self, air: CracQuantities, plant: WaterSideResult) -> F64:
-        """Power of the devices that ``hvac.total_of`` names."""
+        """Sum the power of the devices that ``hvac.total_of`` lists, in W, (B,)."""
         power_w = fields_of(plant) | fields_of(air)
         first, *rest = (power_w[f"{device}_w"] for device in self._hvac_devices)
         return cast(F64, sum(rest, first))
 
     def _power_path_loss_w(self, inputs: StepInputs, it_w: F64) -> tuple[F64, F64]:
-        """Losses of UPS and distribution, which have no power while the data center has none."""
+        """Return the losses of UPS and of distribution, in W, means over the step, (B,) each."""
         path = self._sizing.power_path
         if self._event_free:
             ups_w, distribution_w = path.losses_w(it_w)
@@ -330,7 +335,10 @@ class Facility:
         )
 
     def _energy(self, inputs: StepInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
-        """Losses, battery, grid and emissions; without grid the battery gives what it can."""
+        """Compute losses, battery, grid energy, emissions and cost.
+
+        In an outage, the battery discharges at its maximum, whatever its command.
+        """
         ups_w, distribution_w = self._power_path_loss_w(inputs, it_w)
         overhead_w = hvac_w + (ups_w + distribution_w) if self._counts_losses else hvac_w
         command = inputs.commands.battery_command
@@ -369,7 +377,7 @@ class Facility:
         }
 
     def _air_indices(self, air: HallSums, return_c: F64) -> AirIndices:
-        """Indices of how well the air of the hall is managed."""
+        """Compute the air-management indices of the halls."""
         servers, (low_c, high_c) = self._servers, self._allowable_c
         rises = air.inlet_m3k_s, air.outlet_m3k_s, air.it_airflow_m3s
         return AirIndices(
@@ -383,7 +391,7 @@ class Facility:
     def _run_battery(
         self, stored_kwh: F64, command: F64, *, load_kw: F64, parameters: BatteryParameters
     ) -> BatteryResult:
-        """One step of the batteries."""
+        """Run one step of the battery model."""
         return self._battery_model.step(
             stored_kwh,
             command,
@@ -397,7 +405,7 @@ class Facility:
         )
 
     def _coil_capacity_w(self, surroundings: Surroundings, supply: Supply) -> F64:
-        """Heat that the coils in use can take, mean over the step."""
+        """Return the mean heat that the coils in use can remove during the step, in W, (B,)."""
         cooling_w = self._sizing.water_side.cooling_w
         if not self._event_free:
             cooling_w = cooling_w * supply.coil_share * surroundings.powered
@@ -406,16 +414,16 @@ class Facility:
         return np.minimum(cooling_w, self._while_powered(supply.coil_limit_w, surroundings))
 
     def _while_powered(self, power_w: F64, surroundings: Surroundings) -> F64:
-        """Mean over the step of a power that is drawn while there is power."""
+        """Return the step mean of a power that is drawn only while the data center has power."""
         return power_w if self._event_free else power_w * surroundings.powered
 
 
 class FacilityStage:
-    """Runs the models of a facility as compiled passes over the data centers.
+    """Runs the models of a facility as compiled kernels over the data centers.
 
     Args:
         fleet: B data centers.
-        facility: Their models and sized devices.
+        facility: Models and sized devices of the data centers.
     """
 
     def __init__(self, fleet: Fleet, facility: Facility) -> None:
@@ -426,7 +434,7 @@ class FacilityStage:
         self._removable = CompiledStage(facility.removable_w, fleet.size)
 
     def removable_w(self, surroundings: Surroundings, supply: Supply) -> F64:
-        """Heat that the plant can take during a step, W, (B,)."""
+        """Return the heat that the plant can remove during a step, in W, (B,)."""
         results = self._removable(surroundings=surroundings, supply=supply)
         return results["heat_removed_w"]
 
@@ -438,11 +446,11 @@ class FacilityStage:
         supply: Supply,
         air: HallSums,
     ) -> dict[str, F64]:
-        """Everything that follows from the air of the halls; arguments as of ``StepInputs``.
+        """Run ``Facility.step``; the arguments are the fields of ``StepInputs``.
 
         Returns:
-            Quantities by the names of ``StepResult``, and ``within_limits``, which is 1 for data
-            centers whose results are physical, else 0, (B,).
+            Quantities by their field names in ``StepResult``, and ``within_limits``, (B,): 1 for
+            data centers whose results are physical, else 0.
         """
         results = self._step(
             state=state, commands=commands, surroundings=surroundings, supply=supply, air=air
@@ -454,7 +462,7 @@ class FacilityStage:
 
 
 def _checked_step(facility: Facility, **stages: Any) -> dict[str, F64]:
-    """Results of a facility, and whether they and what they follow from are physical."""
+    """Run a facility step and add ``within_limits``, a check of its inputs and results."""
     results = facility.step(StepInputs(**stages))
     air, surroundings = stages["air"], stages["surroundings"]
     checked = {

@@ -1,8 +1,8 @@
-"""Physical limits of the results of a step, and the errors of results beyond them.
+"""Physical limits of the results of a step, and the errors for results beyond these limits.
 
-They are no design limits: beyond them a hall has burnt, or inputs contradict each other in a way
-that the bounds of single fields cannot show. A run ends there, since later numbers would mean
-nothing.
+The limits are not design limits. A result beyond a limit means that the hall would burn, or that
+inputs contradict each other in a way that the bounds of single fields cannot detect. A run ends at
+such a result, because all later results would be meaningless.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
 
 AIR_LIMITS_C = (-100.0, 400.0)
-"""Limits of air and water, in C: colder than any weather, and where insulation of cables burns by
-itself."""
+"""Limits of air and water temperatures, in C: colder than any weather, and the autoignition of
+cable insulation."""
 WEATHER_LIMITS_C = (-130.0, 100.0)
-"""Limits of weather with its heat waves, in C: the bounds of both together."""
+"""Limits of outdoor temperatures with heat waves, in C: the sum of the bounds of both."""
 BEYOND_NUMBERS_C = 1e12
-"""Outlet, in C, from which on sums over a hall may not fit the kernels' f32."""
+"""Outlet temperature, in C, above which sums over a hall may overflow the kernels' f32."""
 POWER_LIMITS_W = (-1e-3, 1e12)
-"""Limits of powers, in W: none is negative but for rounding, and the world draws some 3e12 W of
-electricity."""
+"""Limits of powers, in W: negative only by round-off, and below the world's electric power of about
+3e12 W."""
 ENERGY_LIMITS_KWH = (-1e-3, 1e12)
-"""Limits of energies of a step, in kWh: as for powers, over one hour."""
+"""Limits of the energies of a step, in kWh: negative only by round-off."""
 LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("outdoor_c", "wet_bulb_c"), WEATHER_LIMITS_C),
     **dict.fromkeys(
@@ -38,17 +38,17 @@ LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("it_w", "hvac_w", "heat_removed_w", "rejected_w"), POWER_LIMITS_W),
     **dict.fromkeys(("grid_kwh", "stored_kwh", "unserved_kwh"), ENERGY_LIMITS_KWH),
 }
-"""Lowest and highest value of quantities of ``StepResult``. Others follow from these."""
+"""Minimum and maximum of quantities of ``StepResult``; the other quantities derive from these."""
 _WHY = "Airflow, power and events of the configuration do not fit together"
 
 
 def within_limits(quantities: Mapping[str, Any]) -> Any:
-    """1 for data centers whose quantities are within their limits, else 0, (B,); NaN never is.
+    """Return 1 for data centers whose quantities are all within ``LIMITS``, else 0, (B,).
 
-    Plain NumPy, which a step runs compiled.
+    NaN counts as beyond the limits. The function is plain NumPy code, which is run compiled.
 
     Args:
-        quantities: quantities of a step by name, with all of ``LIMITS``, (B,) each.
+        quantities: Quantities of a step by name, (B,) each, including all names of ``LIMITS``.
     """
     inside = [
         (quantities[name] >= low) & (quantities[name] <= high)
@@ -58,12 +58,12 @@ def within_limits(quantities: Mapping[str, Any]) -> Any:
 
 
 def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitError:
-    """The error of a step with a result beyond its limits: names data center, quantity and step.
+    """Return the error for a result beyond its limits, naming data center, quantity and step.
 
     Args:
-        inside: what ``within_limits`` returned, (B,).
-        result: the result of the step.
-        fleet: the data centers.
+        inside: Return value of ``within_limits``, (B,).
+        result: Result of the step.
+        fleet: The data centers.
     """
     dc = int(np.argmin(inside))
     values = {name: float(getattr(result, name)[dc]) for name in LIMITS}
@@ -72,7 +72,7 @@ def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitE
         low, high = LIMITS[beyond[0]]
         excess = f"{beyond[0]} is {values[beyond[0]]:.6g}"
     else:
-        # A single rack may burn, which the means of its hall hide.
+        # The means of a hall can hide a single rack that is far too hot.
         (low, high), rack = AIR_LIMITS_C, int(np.argmax(result.rack_outlet_max_c))
         dc = int(fleet.rack_dc[rack])
         number = rack - fleet.rack_offsets[dc]
@@ -83,11 +83,11 @@ def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitE
 
 
 def no_steady_air_error(name: str, sweeps: int) -> PhysicalLimitError:
-    """The error of a hall whose air finds no steady state.
+    """Return the error for a hall whose air temperatures do not converge to a steady state.
 
     Args:
-        name: name of the data center.
-        sweeps: number of sweeps that were tried.
+        name: Name of the data center.
+        sweeps: Number of solver sweeps that were done.
     """
     return PhysicalLimitError(
         f"{name}: no steady air temperatures in {sweeps} sweeps; the CRAC units move too little "
@@ -97,11 +97,12 @@ def no_steady_air_error(name: str, sweeps: int) -> PhysicalLimitError:
 
 
 def no_number_error(outlet_max_c: Reals, fleet: Fleet) -> PhysicalLimitError:
-    """The error of a hall with results that are infinite or not a number.
+    """Return the error for a hall with results that are infinite or NaN.
 
     Args:
-        outlet_max_c: hottest outlet of each rack, in C, (R,), one of them no number.
-        fleet: the data centers.
+        outlet_max_c: Highest outlet temperature of each rack, in C, (R,), with an infinite or NaN
+            entry.
+        fleet: The data centers.
     """
     dc = int(fleet.rack_dc[int(np.argmin(outlet_max_c < BEYOND_NUMBERS_C))])
     return PhysicalLimitError(
