@@ -1,4 +1,4 @@
-"""Many data centers of any size as flat arrays: racks, server groups and servers by offsets."""
+"""Fleet of data centers of any size as flat arrays: racks, server groups and servers by offsets."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
-"""Most racks, servers or other entries of a fleet: what the kernels can index."""
+"""Maximum number of racks, servers or other entries of a fleet, limited by the kernels' int32
+indices."""
 NO_LIMIT_W = 1e30
-"""Capacity of a coil without a limit of its own, in W: a number whose sums are numbers in f32."""
+"""Capacity of a coil without a configured limit, in W; sums of it do not overflow f32."""
 MOST_UNIT_SHARES = 2**25
-"""Most pairs of rack and CRAC unit in a hall, whose shares of supply air take 12 bytes each."""
+"""Maximum number of pairs of rack and CRAC unit in a hall; each pair takes 12 bytes."""
 STAGE_MODELS = {
     "inlet": "hall.inlet_model",
     "outlet": "servers.outlet_model",
@@ -48,16 +49,16 @@ STAGE_MODELS = {
     "placement": "workload.placement",
     "thermal": "simulation.thermal",
 }
-"""Where the config names the model of each stage."""
+"""Config path of the model name of each stage."""
 SHARED_FIELDS = (
     *STAGE_MODELS.values(),
     "simulation.steps_per_hour",
     "hvac.total_of",
     "electrical.losses",
     "simulation.substep_s",
-    "workload.age_horizon_h",  # One queue array serves the fleet; ages are read off its length.
+    "workload.age_horizon_h",  # It is the length of the queue array, which the fleet shares.
 )
-"""Fields of the config whose values the data centers of a fleet have in common."""
+"""Config paths whose values must be equal in all data centers of a fleet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,41 +66,42 @@ class HallAir:
     """Recirculation and CRAC supply of the R racks of B data centers."""
 
     mix_weights: MixWeights
-    """Weights of the exhaust mix before each rack, over all racks of the fleet; copies of a hall
-    share their weights."""
+    """Weights of the racks' exhausts in the exhaust mix before each rack, for all racks of the
+    fleet; copies of a hall share their weights."""
     exhaust_share: F64
-    """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
+    """Share of exhaust air in each rack's intake at height factor 1, (R,)."""
     unit_shares: F64
-    """Share of each CRAC unit of its data center in the supply of each rack, rack by rack."""
+    """Share of each CRAC unit in the supply of each rack of its data center, flat: all racks in
+    order, and for each rack the units of its data center."""
     rack_need_m3s: F64
-    """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
+    """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
     unit_share_offsets: I32
     """First entry of each data center in ``unit_shares``, and the number of entries, (B + 1,)."""
     steady_states: tuple[SteadyStateTable, ...]
-    """Tables of steady states, from which sweeps take their first guess, one per distinct hall."""
+    """Tables of steady states, the initial guesses of the solver, one per distinct hall."""
     steady_state_of_dc: I32
-    """Entry of each data center in ``steady_states``, (B,)."""
+    """Index of each data center's table in ``steady_states``, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
     """Data centers that run in one simulator, as flat arrays.
 
-    There are B data centers with R racks, U CRAC units, G server groups and S servers in all. They
-    share the stage models, the time step and the age horizon of the queue; size, site, season and
-    every other parameter may differ.
+    The B data centers have R racks, U CRAC units, G server groups and S servers in total. Fields
+    listed in ``SHARED_FIELDS`` are equal in all data centers; size, site, season and every other
+    parameter may differ.
     """
 
     configs: tuple[DataCenterConfig, ...]
     """Configuration of each data center, (B,)."""
     models: Mapping[str, str]
-    """Name of the model of each stage, by the stages of ``STAGE_MODELS``."""
+    """Model name of each stage of ``STAGE_MODELS``."""
     steps_per_hour: int
-    """Steps in an hour."""
+    """Number of steps in an hour."""
     rack_offsets: I32
     """First rack of each data center, and the number of racks, (B + 1,)."""
     rack_dc: I32
-    """Data center of each rack, (R,)."""
+    """Index of each rack's data center, (R,)."""
     unit_offsets: I32
     """First CRAC unit of each data center, and the number of units, (B + 1,)."""
     group_offsets: I32
@@ -107,24 +109,25 @@ class Fleet:
     server_offsets: I32
     """First server of each group, and the number of servers, (G + 1,)."""
     approach_k: F64
-    """Mean inlet over supply of each rack, in K, (R,): as given, within the limits of the config;
-    with recirculation what the hall has at its design point."""
+    """Approach temperature of each rack (mean inlet minus supply temperature), in K, (R,): as
+    configured, or with recirculation the value at the design point."""
     group_rows: tuple[F64, ...]
-    """Rows GROUP_INPUTS of the hall kernels by data center, (9, its groups); equal halls share one
-    array."""
+    """Per data center, the rows ``GROUP_INPUTS`` of the hall kernels, (9, groups of the data
+    center); equal halls share one array."""
     dcs: F64
-    """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
+    """Rows ``DC_COEFFICIENTS`` of the hall kernels, (18, B)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     design_flow_m3s: F64
     """Airflow of all CRAC units at the design point, in m3/s, (B,)."""
     unit_capacity_w: F64
-    """Most heat that the coil of each CRAC unit takes out, in W, (U,); ``NO_LIMIT_W`` without."""
+    """Maximum heat that the coil of each CRAC unit removes, in W, (U,); ``NO_LIMIT_W`` if
+    unlimited."""
     setpoint_over_supply_k: F64
-    """Setpoint of the CRAC units over their coldest supply air, in K, (B,): the rise to the return
-    air at the design point with control of return air, else 0."""
+    """Setpoint of the CRAC units minus their coldest supply temperature, in K, (B,): with control
+    of the return air the design temperature rise from supply to return, else 0."""
     air: HallAir | None
-    """How air moves in the halls; None with inlet model ``approach``."""
+    """Recirculation and CRAC supply; None with inlet model ``approach``."""
 
     @property
     def units(self) -> int:
@@ -133,18 +136,18 @@ class Fleet:
 
     @property
     def unit_dc(self) -> I32:
-        """Data center of each CRAC unit, (U,)."""
+        """Index of each CRAC unit's data center, (U,)."""
         return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_offsets))
 
     @property
     def design_speed(self) -> F64:
-        """Speed of the CRAC fans at the design point over full speed, (B,).
+        """Speed of the CRAC fans at the design point, as a share of full speed, (B,).
 
-        At most 1, and at least the lowest speed of the fans: units that are far too large give more
-        than the design airflow.
+        The speed is limited to the range from the fans' minimum speed to 1. At minimum speed, units
+        that are far too large supply more than the design airflow.
         """
         speed = self.design_flow_m3s / self.unit_sums(self.unit_design_m3s)
-        # Units that are just large enough run at full speed, whatever the last bits of sums.
+        # Round-off in the sums must not keep units that are just large enough from full speed.
         speed = np.where(speed > 1.0 - 1e-9, 1.0, speed)
         return np.maximum(speed, self.values("hvac.crac.min_flow_ratio"))
 
@@ -155,7 +158,7 @@ class Fleet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the data centers; only run folders and recordings need them to differ."""
+        """Names of the data centers; only run folders and recordings require distinct names."""
         return tuple(c.name for c in self.configs)
 
     @property
@@ -174,10 +177,10 @@ class Fleet:
         return int(self.server_offsets[-1])
 
     def require_distinct_names(self) -> None:
-        """Make sure that names tell the data centers apart.
+        """Check that the names of the data centers are distinct.
 
         Raises:
-            ConfigError: a name that is used twice.
+            ConfigError: Two data centers have the same name.
         """
         seen: set[str] = set()
         for name in self.names:
@@ -186,36 +189,36 @@ class Fleet:
             seen.add(name)
 
     def values(self, path: str) -> F64:
-        """A numeric config field of every data center, (B,); None becomes nan."""
+        """Return a numeric config field of every data center, (B,); None becomes nan."""
         return np.array([*map(attrgetter(path), self.configs)], dtype=np.float64)
 
     def unit_sums(self, values: npt.ArrayLike) -> F64:
-        """Sum of unit values, (U,), over each data center, (B,)."""
+        """Sum values of CRAC units, (U,), within each data center, (B,)."""
         return _sums(values, self.unit_offsets)
 
     def rack_sums(self, values: npt.ArrayLike) -> F64:
-        """Sum of rack values, (R,), over each data center, (B,)."""
+        """Sum values of racks, (R,), within each data center, (B,)."""
         return _sums(values, self.rack_offsets)
 
     def group_sums(self, values: npt.ArrayLike) -> F64:
-        """Sum of group values, (G,), over each rack, (R,)."""
+        """Sum values of server groups, (G,), within each rack, (R,)."""
         return _sums(values, self.group_offsets)
 
     def per_group_servers(self) -> F64:
-        """Servers of each group, (G,)."""
+        """Return the number of servers of each group, (G,)."""
         return np.diff(self.server_offsets).astype(np.float64)
 
     def per_rack_servers(self) -> F64:
-        """Servers of each rack, (R,)."""
+        """Return the number of servers of each rack, (R,)."""
         return np.diff(self.server_offsets[self.group_offsets]).astype(np.float64)
 
     def per_dc_servers(self) -> F64:
-        """Servers of each data center, (B,)."""
+        """Return the number of servers of each data center, (B,)."""
         counts = np.diff(self.server_offsets[self.group_offsets[self.rack_offsets]])
         return counts.astype(np.float64)
 
     def server_rack(self) -> I32:
-        """Rack of each server, (S,)."""
+        """Return the index of each server's rack, (S,)."""
         per_rack = np.diff(self.server_offsets[self.group_offsets])
         return np.repeat(np.arange(self.racks, dtype=np.int32), per_rack)
 
@@ -225,23 +228,24 @@ class _HallArrays:
     """Arrays of one hall of R racks, G server groups and U CRAC units."""
 
     groups_per_rack: I32
-    """Server groups of each rack, (R,)."""
+    """Number of server groups of each rack, (R,)."""
     groups: F64
-    """Rows GROUP_INPUTS of the hall kernels, (9, G)."""
+    """Rows ``GROUP_INPUTS`` of the hall kernels, (9, G)."""
     approach_k: F64
-    """Mean inlet over supply of each rack at the design point, in K, (R,)."""
+    """Mean inlet temperature of each rack minus supply temperature at the design point, in K,
+    (R,)."""
     dc: F64
-    """Rows DC_COEFFICIENTS of the hall kernels, (18,)."""
+    """Rows ``DC_COEFFICIENTS`` of the hall kernels, (18,)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     design_flow_m3s: float
     """Airflow of all CRAC units at the design point, in m3/s."""
     setpoint_over_supply_k: float
-    """Setpoint of the CRAC units over their coldest supply air, in K."""
+    """Setpoint of the CRAC units minus their coldest supply temperature, in K."""
     air: _Air | None
-    """How air moves in the hall; None with inlet model ``approach``."""
+    """Recirculation and CRAC supply; None with inlet model ``approach``."""
     odd: tuple[str, ...]
-    """Messages about what is odd about the airflows of the hall."""
+    """Warnings about unusual airflows of the hall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,15 +253,15 @@ class _Air:
     """Recirculation and CRAC supply of one hall of R racks and U CRAC units."""
 
     mix_weights: MixWeights
-    """Weights of the exhaust mix before each rack."""
+    """Weights of the racks' exhausts in the exhaust mix before each rack."""
     exhaust_share: F64
-    """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
+    """Share of exhaust air in each rack's intake at height factor 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
     rack_need_m3s: F64
-    """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
+    """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
     steady_states: SteadyStateTable
-    """Steady states, from which sweeps take their first guess."""
+    """Table of steady states, the initial guesses of the solver."""
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -267,10 +271,10 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         configs: One data center, or several.
 
     Raises:
-        ConfigError: no data center, or stage models, time steps or age horizons that differ.
+        ConfigError: There is no data center, or a field of ``SHARED_FIELDS`` differs.
 
     Warns:
-        OddInputWarning: what is possible, but probably not meant.
+        OddInputWarning: A value is valid, but probably a mistake.
     """
     listed = _listed(configs)
     warn_of_odd_values(listed)
@@ -305,12 +309,12 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
 
 
 def shared_values(config: DataCenterConfig) -> tuple[Any, ...]:
-    """Values of ``SHARED_FIELDS`` of a data center; those with equal ones can form a fleet."""
+    """Return the values of ``SHARED_FIELDS``, which must be equal for configs of one fleet."""
     return tuple(attrgetter(path)(config) for path in SHARED_FIELDS)
 
 
 def _listed(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> tuple[DataCenterConfig, ...]:
-    """Configs of a fleet, checked to be some."""
+    """Return the configs of a fleet as a tuple, checked for type and for being non-empty."""
     listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
     for config in listed:
         if not isinstance(config, DataCenterConfig):
@@ -323,13 +327,13 @@ def _listed(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> tuple[Dat
 
 
 def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
-    """Arrays of each data center's hall, made once for data centers whose halls are alike."""
+    """Build the arrays of each data center's hall, once for data centers with equal halls."""
     cache: dict[Any, _HallArrays] = {}
-    # Copies share the sections themselves; comparing those takes a while where servers differ.
+    # Copies of a data center share section objects; comparing ids avoids slow field comparisons.
     known: dict[Any, _HallArrays] = {}
     halls = []
     for config in configs:
-        # The density of the air belongs to the site.
+        # The density of the air depends on the site unless it is configured.
         place = None
         if config.hall.air_density_kg_m3 is None:
             place = config.site.location, config.site.weather_file
@@ -346,7 +350,7 @@ def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
 
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
-    """Value of a config field that all data centers of a fleet share."""
+    """Return the value of a config field, checked to be equal in all data centers."""
     values = [*map(attrgetter(path), configs)]
     for config, value in zip(configs, values, strict=True):
         if value != values[0]:
@@ -358,7 +362,7 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
 
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
-    """Arrays of the hall of one data center."""
+    """Build the arrays of the hall of one data center."""
     hall, curves = config.hall, config.servers.curves
     servers = rack_servers(config)
     if servers.count.sum() > MOST_ENTRIES:
@@ -412,14 +416,14 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
 
 
 def _capacity_w(config: DataCenterConfig) -> F64:
-    """Most heat that the coil of each CRAC unit of a data center takes out, in W, (U,)."""
+    """Return the maximum heat that the coil of each CRAC unit removes, in W, (U,)."""
     crac = config.hvac.crac
-    given_w = NO_LIMIT_W if crac.capacity_kw is None else 1e3 * np.asarray(crac.capacity_kw)
-    return np.broadcast_to(np.asarray(given_w, np.float64), (crac.units,))
+    limit_w = NO_LIMIT_W if crac.capacity_kw is None else 1e3 * np.asarray(crac.capacity_kw)
+    return np.broadcast_to(np.asarray(limit_w, np.float64), (crac.units,))
 
 
 def _unit_supply(config: DataCenterConfig, recirculation: Recirculation) -> tuple[F64, F64]:
-    """Shares of the CRAC units in the supply of the racks, (R, U), and airflows, in m3/s, (U,)."""
+    """Return unit shares in the racks' supply, (R, U), and full-speed airflows, in m3/s, (U,)."""
     crac, racks = config.hvac.crac, config.hall.racks
     if racks * crac.units > MOST_UNIT_SHARES:
         raise ConfigError(
@@ -437,14 +441,14 @@ def _unit_supply(config: DataCenterConfig, recirculation: Recirculation) -> tupl
         crac, shares.T @ recirculation.need_m3s, recirculation.design.crac_flow_m3s
     )
     if crac.airflow_m3s is not None:
-        # Large units reach further than small ones.
+        # Units with a large airflow supply more of each rack than distance alone suggests.
         weight = unit_weights(shares, recirculation.need_m3s, airflow_m3s)
         shares = weighted_shares(shares, weight)
     return shares, airflow_m3s
 
 
 def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers) -> F64:
-    """Heat capacity of one server of each group, in J/K, (G,)."""
+    """Return the heat capacity of one server of each group, in J/K, (G,)."""
     kj_per_k = config.servers.heat_capacity_kj_per_k
     if kj_per_k is None:
         return SERVER_J_PER_K_W * servers.full_w
@@ -452,7 +456,7 @@ def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers
 
 
 def _group_inputs(servers: RackServers, full_airflow: F64) -> dict[str, F64]:
-    """Rows GROUP_INPUTS of the hall kernels that follow from servers and their air, (G,) each."""
+    """Return the rows of ``GROUP_INPUTS`` that depend on servers and air, by name, (G,) each."""
     names = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height_factor")
     fan_w = servers.fan_reference_w
     return {name: getattr(servers, name) for name in names} | {
@@ -463,7 +467,7 @@ def _group_inputs(servers: RackServers, full_airflow: F64) -> dict[str, F64]:
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
-    """Recirculation of all halls end to end; copies of a hall share weights and steady states."""
+    """Concatenate the recirculation of all halls; equal halls share weights and steady states."""
     airs = [h.air for h in halls if h.air is not None]
     distinct = list({id(air): air for air in airs}.values())
     entry_of = {id(air): i for i, air in enumerate(distinct)}
@@ -482,11 +486,11 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
 
 
 def _joined(distinct: Sequence[MixWeights], entry: I32) -> MixWeights:
-    """Weights of many halls as those of one.
+    """Combine the mix weights of all halls into one object, with racks numbered over the fleet.
 
     Args:
-        distinct: Weights of the halls that differ.
-        entry: Which of them each data center has, (B,).
+        distinct: Weights of each distinct hall.
+        entry: Index into ``distinct`` for each data center, (B,).
     """
     halls = [distinct[i] for i in entry]
     first_rack = offsets_from_counts([len(w.norm) for w in halls], "racks")
@@ -508,19 +512,19 @@ def _joined(distinct: Sequence[MixWeights], entry: I32) -> MixWeights:
 
 
 def _sums(values: npt.ArrayLike, offsets: I32) -> F64:
-    """Sums over the entries between consecutive offsets."""
+    """Sum the values between consecutive offsets."""
     return np.asarray(np.add.reduceat(np.asarray(values, dtype=np.float64), offsets[:-1]))
 
 
 def offsets_from_counts(counts: npt.ArrayLike, what: str) -> I32:
-    """Where the parts of each entry begin, and where the last end, (n + 1,).
+    """Return the offset of the first part of each entry, and the total, (n + 1,).
 
     Args:
-        counts: Parts of each entry, (n,).
-        what: Name of the parts, for errors.
+        counts: Number of parts of each entry, (n,).
+        what: Name of the parts, for the error message.
 
     Raises:
-        ConfigError: naming ``what`` when there are more than the kernels can index.
+        ConfigError: The total exceeds what the kernels can index.
     """
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     if offsets[-1] > MOST_ENTRIES:

@@ -1,4 +1,4 @@
-"""Configurations of a fleet: copies of one data center over sites, with sampled values."""
+"""Configurations of a fleet: copies of one data center at several sites, with sampled values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sdc_taichi.errors import ConfigError, DataError, shortened, suggestion, who
 from sdc_taichi.exogenous.weather import read_city
 
 MOST_DCS = 10_000_000
-"""Most data centers of a fleet, more than any memory holds."""
+"""Maximum number of data centers of a fleet, more than fit into any memory."""
 
 
 def make_configs(
@@ -26,21 +26,23 @@ def make_configs(
     sample: Mapping[str, Any] | None = None,
     seed: int = 0,
 ) -> list[DataCenterConfig]:
-    """Copies of one data center over sites, with domain randomisation.
+    """Create copies of one data center at several sites, with domain randomisation.
 
-    A copy is named after its site, or else after its place, see ``locations``; where there are more
-    copies than sites, its number is added.
+    A copy is named after its location (see ``locations``), with its index appended if there are
+    more copies than sites.
 
     Args:
-        base: The data center to copy.
-        count: Number of copies; None is one per site. Sites are dealt in turn.
-        sites: Location names; empty keeps the location of ``base``.
-        sample: Config path to ``{"uniform": [low, high]}`` or ``{"choice": [a, b, ...]}``.
-        seed: Seed of the sampling; copy i draws the same values whatever ``count`` is.
+        base: Config of the data center to copy.
+        count: Number of copies, which are assigned to the sites in rotation; None makes one copy
+            per site.
+        sites: Location names; an empty sequence keeps the location of ``base``.
+        sample: Sampling rule by config path: ``{"uniform": [low, high]}`` or
+            ``{"choice": [a, b, ...]}``.
+        seed: Seed of the sampling; the values of copy i do not depend on ``count``.
 
     Raises:
-        ConfigError: count below 1, sites beside a weather or carbon file that would be read for
-            each of them, or a sampling rule or drawn value that is not valid.
+        ConfigError: ``count`` is below 1, ``sites`` are combined with a weather or carbon file of
+            ``base``, or a sampling rule or a sampled value is not valid.
     """
     if isinstance(sites, str):
         raise ConfigError(f"sites {shortened(sites)}: valid is a list of names")
@@ -78,9 +80,9 @@ def make_configs(
 
 
 def locations(configs: Sequence[DataCenterConfig]) -> list[str]:
-    """Where data centers stand: ``site.location``, or the city of the weather file in its place.
+    """Return the location of each data center: ``site.location``, or the weather file's city.
 
-    A weather file without a city, or one that cannot be read, is named by its stem.
+    If a weather file has no city or cannot be read, its file name without suffix is the location.
     """
     cities: dict[str, str] = {}
     places = []
@@ -93,7 +95,7 @@ def locations(configs: Sequence[DataCenterConfig]) -> list[str]:
 
 
 def place_names(configs: Sequence[DataCenterConfig]) -> list[str]:
-    """Locations as names: lower case, with ``-`` for all but letters, digits, ``_`` and ``-``."""
+    """Return locations as names: lower case, with ``-`` for all but letters, digits and ``_``."""
     names = (re.sub(r"[^\w-]+", "-", place.lower()).strip("-") for place in locations(configs))
     return [name or "unnamed" for name in names]
 
@@ -106,10 +108,10 @@ def _city(weather_file: str) -> str:
 
 
 def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
-    """Make sure that a sampling rule is one, and that its first value suits the config.
+    """Check the form of a sampling rule, and that its first value is valid in the config.
 
     Raises:
-        ConfigError: naming the path and what is valid.
+        ConfigError: The rule is not valid; the message names the config path and valid rules.
     """
     where = f"sample {path}"
     if not isinstance(rule, Mapping) or len(rule) != 1:
@@ -131,7 +133,7 @@ def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
 
 
 def _draw(rule: Mapping[str, Any], rng: np.random.Generator) -> Any:
-    """A value by a sampling rule; whole numbers where both ends of ``uniform`` are."""
+    """Draw a value by a sampling rule; ``uniform`` with two integer limits draws integers."""
     ((kind, values),) = rule.items()
     if kind == "choice":
         return values[int(rng.integers(len(values)))]

@@ -1,4 +1,4 @@
-"""The halls of a fleet on the hall kernels: supply air and load in, temperatures out."""
+"""Solver of a fleet's halls: run the hall kernels from supply air and load to temperatures."""
 
 from __future__ import annotations
 
@@ -36,23 +36,25 @@ from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
 
 @dataclass(frozen=True, slots=True)
 class HallState:
-    """Thermal memory of transient halls; quasi-steady halls have none."""
+    """Thermal state of transient halls between steps; quasi-steady halls have no such state."""
 
     server_c: Reals
     """Temperature of the servers of each group, in C, (G,)."""
     mixed_c: Reals
     """Temperature of the recirculated air before each rack, in C, (R,)."""
     exhaust_c: Reals
-    """Temperature that each rack gives to the exhaust mixes, times its strength, in C, (R,): its
-    outlet, and for the share of its air that failing fans do not move the mix before it."""
+    """Exhaust temperature of each rack multiplied by its weight (strength) in the exhaust mixes, in
+    C, (R,): that of its outlet, mixed with ``mixed_c`` for the airflow that failed fans lack."""
     captured_m3s: Reals
-    """Recirculated air that each rack takes in, in m3/s, (R,)."""
+    """Recirculated air that each rack draws in, in m3/s, (R,)."""
     need_m3s: F64
-    """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
+    """Supply airflow that the racks demand from each CRAC unit, in m3/s, (U,)."""
     following: F64
-    """Fan speed of each CRAC unit over full speed that would just cover the need, (U,)."""
+    """Fan speed at which each CRAC unit would just meet ``need_m3s``, as a share of full speed,
+    (U,)."""
     supply_excess_k: F64
-    """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,)."""
+    """Supply temperature of each CRAC unit minus its setpoint and minus the warming of the room by
+    stored heat, in K, (U,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,27 +64,27 @@ class Coil:
     setpoint_c: F64
     """Supply setpoint of each CRAC unit, in C, (U,)."""
     room_j: F64
-    """Heat held by the room at the start of the step, over the setpoint, in J, (B,)."""
+    """Heat stored in the room at the start of the step, relative to the setpoint, in J, (B,)."""
     room_j_per_k: F64
     """Heat capacity of the room, in J/K, (B,)."""
     limit_w: F64
-    """Heat that the plant can take during the step, in W, (B,)."""
+    """Maximum heat that the plant can remove during the step, in W, (B,)."""
     fan_w_per_m3s: F64
-    """CRAC fan power over airflow at full speed, in W/(m3/s), (B,)."""
+    """CRAC fan power divided by airflow, both at full speed, in W/(m3/s), (B,)."""
 
 
 Precision = Literal["f32", "f64"]
 
 SERIAL_GROUPS = 8192
-"""Up to so many places of groups, counted again in every substep, or servers of layers, one thread
-computes all: waking a second one takes longer."""
+"""Problem size up to which a kernel runs on one thread, because waking another thread would take
+longer: group entries times substeps for steps, servers for layers."""
 SLICES_PER_THREAD = 8
-"""Parts that each thread takes on, so that threads end at about the same time."""
+"""Number of work slices per thread; several slices balance the load of the threads."""
 TOLERANCE_K: dict[Precision, float] = {"f32": 2e-4, "f64": 1e-12}
-"""How little another sweep would move the exhaust mix before any rack, in K."""
+"""Convergence tolerance in K: change of the exhaust mix before any rack by a further sweep."""
 MOST_SWEEPS = 2000
-"""Steady states take 2 to 40 sweeps, and some hundred where the CRAC units give a tenth of the air
-that the servers draw."""
+"""Maximum number of sweeps. Steady states take 2 to 40 sweeps, and several hundred if the CRAC
+units supply a tenth of the airflow of the servers."""
 
 
 @dataclass(slots=True)
@@ -90,54 +92,57 @@ class Conditions:
     """Boundary conditions of the halls during one step."""
 
     unit_supply_c: F64
-    """Supply air of each CRAC unit, in C, (U,)."""
+    """Supply temperature of each CRAC unit, in C, (U,)."""
     utilisation: F64
     """Mean utilisation of the servers of each data center, 0..1, (B,)."""
     rack_load: F64 | None = None
-    """Utilisation of each rack while it is on, 0..1, (R,); None loads all racks alike."""
+    """Utilisation of each rack while it is on, 0..1, (R,); None uses ``utilisation`` for all
+    racks."""
     group_load: F64 | None = None
-    """Utilisation of each server group while its rack is on, 0..1, (G,); None spreads the load of
-    a rack by the load weights of its groups."""
+    """Utilisation of each server group while its rack is on, 0..1, (G,); None distributes the load
+    of a rack by the load weights of its groups."""
     powered: F64 | None = None
-    """Share of the step that each rack is on, 0..1, (R,); None is all of it."""
+    """Share of the step during which each rack is on, 0..1, (R,); None means the whole step."""
     rack_airflow: F64 | None = None
-    """Share of their airflow left to the fans of each rack, 0..1, (R,); None is all of it."""
+    """Remaining airflow of each rack's fans as a share of full airflow, 0..1, (R,); None means
+    full airflow."""
     unit_low: F64 | None = None
-    """Lowest fan speed of each CRAC unit over full speed, (U,); None is full speed."""
+    """Minimum fan speed of each CRAC unit as a share of full speed, (U,); None means full speed."""
     unit_high: F64 | None = None
-    """Highest fan speed of each CRAC unit over full speed, (U,); None is full speed."""
+    """Maximum fan speed of each CRAC unit as a share of full speed, (U,); None means full speed."""
     unit_running: F64 | None = None
-    """1 for CRAC units that run, 0 for those whose fan coasts without cooling, (U,); None runs
-    all."""
+    """1 for running CRAC units, 0 for units whose fan coasts without cooling, (U,); None means
+    that all run."""
 
 
 @dataclass
 class HallSums(HallQuantities):
-    """Results of one step: sums and means of each data center, and values of each rack."""
+    """Hall results of one step: sums and means of each data center, and values of each rack."""
 
     inlet_m3k_s: F64
-    """Sum over the servers of airflow times inlet temperature over supply, in m3 K/s, (B,)."""
+    """Sum over the servers of airflow times (inlet minus supply temperature), in m3 K/s, (B,)."""
     outlet_m3k_s: F64
-    """Sum over the servers of airflow times outlet temperature over supply, in m3 K/s, (B,)."""
+    """Sum over the servers of airflow times (outlet minus supply temperature), in m3 K/s, (B,)."""
     over_27_sum_k: F64
-    """Sum over the servers of the inlet temperature in excess of 27 C, in K, (B,)."""
+    """Sum over the servers of the inlet temperature's excess above 27 C, in K, (B,)."""
     under_18_sum_k: F64
     """Sum over the servers of the inlet temperature's shortfall below 18 C, in K, (B,)."""
     units_flow_m3s: F64
-    """Airflow of the CRAC units, in m3/s, (B,); 0 with inlet model ``approach``."""
+    """Total airflow of the CRAC units, in m3/s, (B,); 0 with inlet model ``approach``."""
     units_return_c: F64
-    """Return air of the CRAC units, in C, (B,); 0 with inlet model ``approach``."""
+    """Return temperature of the CRAC units, in C, (B,); 0 with inlet model ``approach``."""
     units_load_w: F64
-    """Heat of air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in steady air."""
+    """Heat from return air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in
+    quasi-steady halls."""
     coil_w: F64
-    """Heat that the coils take out, in W, (B,); 0 in steady air."""
+    """Heat that the coils remove, in W, (B,); 0 in quasi-steady halls."""
     unit_airflow_m3s: F64
-    """Airflow of each CRAC unit, in m3/s, (U,); of no meaning with inlet model ``approach``."""
+    """Airflow of each CRAC unit, in m3/s, (U,); meaningless with inlet model ``approach``."""
     cubed_flow_m3s: F64
-    """Sum over the CRAC units of airflow at full speed times the mean cube of the fan speed over
-    full speed, 0 for units that are down, in m3/s, (B,)."""
+    """Sum over the running CRAC units of full-speed airflow times the step mean of the cubed
+    relative fan speed, in m3/s, (B,)."""
     room_j: F64
-    """Heat held by the room at the end of the step, over the setpoint, in J, (B,)."""
+    """Heat stored in the room at the end of the step, relative to the setpoint, in J, (B,)."""
 
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
@@ -146,13 +151,13 @@ _OUTLET_MAX_ROW = [*RACK_OUT].index("outlet_max_c")
 
 
 class Hall:
-    """Temperatures and power of all halls of a fleet: steady, in equal substeps, by server.
+    """Computes temperatures and power of all halls of a fleet, steady or in transient substeps.
 
-    Arrays of the kernels live as long as the object.
+    The object owns the arrays of the kernels.
 
     Args:
-        fleet: the data centers.
-        precision: ``f32`` or ``f64``, of temperatures and powers of servers and racks.
+        fleet: The data centers.
+        precision: Precision of the temperatures and powers of servers and racks.
     """
 
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
@@ -173,7 +178,8 @@ class Hall:
         fresh_share = fleet.dcs[row_index(DC_COEFFICIENTS, "fresh_share")]
         self._fresh_m3s = fresh_share[fleet.unit_dc] * fleet.unit_design_m3s
         self._overridden_rows: set[str] = set()
-        """Rows (``powered``, ``fan_airflow``) that the last step set to other values than 1."""
+        """Names of the rows (``powered``, ``fan_airflow``) that the last step set to values other
+        than 1."""
 
         self._step_kernel = NamedKernel(hall.hall_kernel(precision), STEP_ARGUMENTS)
         self._layers_kernel = NamedKernel(layers.layers_kernel(precision), LAYERS_ARGUMENTS)
@@ -197,30 +203,30 @@ class Hall:
         self._returns_buffers = (
             self._places.count == fleet.racks and fleet.models["outlet"] == "server"
         )
-        """Whether the racks' results are returned without a copy. Other outlets than those of
-        the servers are read again by the layers."""
+        """True if the racks' results are returned without a copy. With an outlet model other than
+        ``server``, the layers kernel reads these results again, so callers must get a copy."""
         self._has_rows_along_racks = False
         self.hottest_outlet_c = 0.0
-        """Hottest outlet of a server of all halls in the last step, in C."""
+        """Highest server outlet temperature of all halls in the last step, in C."""
         self._was_transient: bool | None = None
-        """Whether the last step was transient; None without one."""
+        """True if the last step was transient; None if there is no last step."""
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
-        """Layers of the groups, as such and as arguments, once they are asked for."""
+        """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
 
     @property
     def sweeps(self) -> I32:
-        """Sweeps, or substeps, that each data center took in the last step, (B,)."""
+        """Number of sweeps or substeps of each data center in the last step, (B,)."""
         return np.array(self._control["sweep"])
 
     def solve(self, conditions: Conditions) -> HallSums:
-        """Quasi-steady temperatures and power.
+        """Compute quasi-steady temperatures and power.
 
         Args:
-            conditions: supply air, load and what is out of order.
+            conditions: Supply air, load and failures.
 
         Raises:
-            PhysicalLimitError: no steady state, as when no unit moves air.
-            SdcError: conditions that are not finite.
+            PhysicalLimitError: There is no steady state, for example because no unit moves air.
+            SdcError: A condition is not finite or has the wrong shape.
         """
         self._set_conditions(conditions)
         self._unit_state["fresh_ratio"][:] = 1.0
@@ -239,17 +245,17 @@ class Hall:
     def advance(
         self, conditions: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
     ) -> tuple[HallSums, HallState]:
-        """One step of transient halls, in equal substeps of at most ``substep_s``.
+        """Advance transient halls by one step, in equal substeps of at most ``substep_s``.
 
         Args:
-            conditions: load and what is out of order; supply air follows from the coil.
-            state: memory at the start of the step.
-            coil: setpoints, heat held by the room and what the plant can take.
-            step_s: length of the step.
-            substep_s: longest substep.
+            conditions: Load and failures; the supply temperature follows from ``coil``.
+            state: Thermal state at the start of the step.
+            coil: Setpoints, heat stored in the room, and the limit of the plant.
+            step_s: Length of the step, in s.
+            substep_s: Maximum length of a substep, in s.
 
         Returns:
-            Means over the step, and the memory at its end.
+            Means over the step, and the thermal state at its end.
         """
         self._set_conditions(conditions)
         self._set_state(state)
@@ -271,13 +277,13 @@ class Hall:
         return self._results(dc_out, transient=True), self._hall_state(after)
 
     def steady_state(self, conditions: Conditions) -> HallState:
-        """State of transient halls that have been in the given conditions for ever."""
+        """Return the thermal state of transient halls in equilibrium with constant conditions."""
         self.solve(conditions)
         for name, value in (("room_j", 0.0), ("room_j_per_k", 1.0), ("coil_limit_w", 0.0)):
             self._dc[name][:] = value
         server_c = np.zeros(self._fleet.groups, self._dtype)
-        # A substep that lasts for ever brings servers to their steady temperatures; what it makes
-        # of the air is put back.
+        # One very long substep brings the servers to their steady temperatures. It also changes
+        # the air, which is already steady and is therefore restored afterwards.
         air = [self._memory["mixed_c"]]
         air += [self._unit_state[name] for name in ("fresh_ratio", "supply_c", "excess_k")]
         steady = [row.copy() for row in air]
@@ -297,18 +303,20 @@ class Hall:
         return self._hall_state(server_c)
 
     def discard_last_step(self) -> None:
-        """Drop the last step, so that ``servers`` cannot show layers of another state."""
+        """Forget the last step, so that ``servers`` cannot return layers of an outdated state."""
         self._was_transient = None
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
-        """Per-server layers of the last ``solve``, or the end of the last ``advance``, each (S,).
+        """Return inlet, outlet and power of every server in the last step, (S,) each.
+
+        After ``advance``, the values are those at the end of the step.
 
         Args:
-            into: layers to overwrite and return; None allocates new ones.
+            into: Layers to overwrite and return; None allocates new ones.
 
         Raises:
-            RuntimeStateError: before the first step.
-            SdcError: layers of another shape, type or order, or that may not be written.
+            RuntimeStateError: No step has been done.
+            SdcError: ``into`` has a wrong shape, type or memory order, or is read-only.
         """
         shape = (self._fleet.servers,)
         if into is None:
@@ -336,12 +344,12 @@ class Hall:
         return into
 
     def groups(self) -> ServerLayers:
-        """Inlet, outlet and power of one server of each group in the last step, each (G,).
+        """Return inlet, outlet and power of one server of each group in the last step, (G,) each.
 
-        The next call of ``groups`` or ``group_inlets`` overwrites them.
+        The next call of ``groups`` or ``group_inlets`` overwrites the returned arrays.
 
         Raises:
-            RuntimeStateError: before the first step.
+            RuntimeStateError: No step has been done.
         """
         if self._group_layers is None:
             layers = [self._aligned((self._fleet.groups,)) for _ in range(3)]
@@ -351,30 +359,33 @@ class Hall:
         return layers_of_groups
 
     def group_inlets(self) -> F64:
-        """Inlet of every server group in the last step, in C, (G,).
+        """Return the inlet temperature of every server group in the last step, in C, (G,).
 
         Raises:
-            RuntimeStateError: before the first step.
+            RuntimeStateError: No step has been done.
         """
         return self.groups().inlet_c.astype(np.float64)
 
     def intake_air(self, setpoint_c: F64) -> IntakeAir:
-        """Air before the racks after a step, with the setpoint of each CRAC unit, in C, (U,).
+        """Return the air before the racks after the last step.
+
+        Args:
+            setpoint_c: Supply setpoint of each CRAC unit, in C, (U,), to store in the result.
 
         Raises:
-            RuntimeStateError: before the first step.
+            RuntimeStateError: No step has been done.
         """
         self._require_step()
         return read_intake_air(self._tables, self._rack_out, self._exhaust(), setpoint_c)
 
     def _require_step(self) -> bool:
-        """Whether the last step was transient; an error without one."""
+        """Return True if the last step was transient; raise an error if there is no last step."""
         if self._was_transient is None:
             raise RuntimeStateError("no step has been done yet; air and servers exist after one")
         return self._was_transient
 
     def _set_conditions(self, conditions: Conditions) -> None:
-        """Check conditions and write them to the inputs of the kernels."""
+        """Check the conditions of a step and write them to the input arrays of the kernels."""
         for name, shape in self._shapes.items():
             values = getattr(conditions, name)
             if values is None:
@@ -413,7 +424,7 @@ class Hall:
         self._unit_state["excess_k"][:] = 0.0
 
     def _set_state(self, state: HallState) -> None:
-        """Thermal memory and CRAC airflow at the start of a transient step."""
+        """Write thermal state and CRAC airflow at the start of a transient step to the kernels."""
         fleet = self._fleet
         for name in ("mixed_c", "exhaust_c", "captured_m3s"):
             self._places.put(self._memory[name], getattr(state, name))
@@ -425,7 +436,7 @@ class Hall:
         self._dc["crac_m3s_per_rack"][:] = flow_m3s / np.diff(fleet.rack_offsets)
 
     def _set_coil(self, coil: Coil, excess_k: F64) -> None:
-        """Setpoints, room and plant of a transient step, and the supply air it begins with."""
+        """Write setpoints, room, plant limit and first supply temperature of a transient step."""
         self._unit["setpoint_c"][:] = coil.setpoint_c
         for name, values in (
             ("room_j", coil.room_j),
@@ -438,11 +449,16 @@ class Hall:
         self._unit_state["supply_c"][:] = coil.setpoint_c + warmed_k + excess_k
 
     def _begin_step(self, exchanges_before: int) -> None:
-        """The first sweep exchanges what ``exhaust_c`` holds, or looks up its first guess."""
+        """Reset the control rows of the kernel for a new step.
+
+        Args:
+            exchanges_before: 1 if the first sweep starts from the stored ``exhaust_c``, 0 if it
+                looks up an initial guess.
+        """
         first = {
             "status": RUNNING,
             "exchanges_before": exchanges_before,
-            # A sweep that exchanges reads the other side.
+            # A sweep reads the exhaust buffer of the other side.
             "exhaust_side": exchanges_before,
             "sweep": 0,
             "chunks_done": 0,
@@ -453,7 +469,7 @@ class Hall:
             self._dc[name][:] = 0.0
 
     def _run_sweeps(self, dc_out: F64, sweeps: int, **arguments: Any) -> None:
-        """Call the kernel until every data center has come to its end."""
+        """Call the kernel until every data center has converged or reached its last sweep."""
         status = self._control["status"]
         while np.maximum.reduce(status) == RUNNING:
             self._call_step_kernel(dc_out, sweeps=sweeps, **arguments)
@@ -469,7 +485,10 @@ class Hall:
         server_c_before: Any = None,
         server_c_after: Any = None,
     ) -> None:
-        """One call: all sweeps of data centers that are one task, a sweep of the others."""
+        """Call the step kernel once.
+
+        A call does all sweeps of data centers that form a single task, and one sweep of the others.
+        """
         runtime.ensure_started()
         group_places = self._tables.group_places
         if transient and len(self._server_c) < group_places:
@@ -492,7 +511,7 @@ class Hall:
             self._step_kernel.release("server_c_before", "server_c_after")
 
     def _call_layers_kernel(self, arguments: dict[str, Any], per_group: int) -> None:
-        """Values of the last step to servers, or to each group once."""
+        """Compute layers of the last step: per group if ``per_group`` is 1, else per server."""
         transient = self._require_step()
         runtime.ensure_started()
         if not self._has_rows_along_racks:
@@ -508,11 +527,11 @@ class Hall:
             **arguments,
         )
         if self._returns_buffers:
-            # The results of the step hold these arrays; the kernel needs them no more.
+            # The arrays belong to the returned results, so the kernel must not hold them.
             self._layers_kernel.release("rack_out")
 
     def _layer_arguments(self, layers: list[Any]) -> dict[str, Any]:
-        """Layers as the kernel takes them: by number, and as whole vectors."""
+        """Return layers as kernel arguments: as flat arrays, and as views of whole vectors."""
         whole = len(layers[0]) // LANES * LANES
         arguments = dict(zip(("inlet_c", "outlet_c", "power_w"), layers, strict=True))
         for name, layer in zip(("inlet", "outlet", "power"), layers, strict=True):
@@ -521,7 +540,7 @@ class Hall:
         return arguments
 
     def _add_rows_along_racks(self) -> None:
-        """Group inputs whose lanes are groups of one rack, for layers alone."""
+        """Add group inputs whose lanes are groups of one rack, which only layers read."""
         arrays = self._tables.arrays
         self._step_kernel.release("group_inputs")
         self._layers_kernel.release("group_inputs")
@@ -534,16 +553,16 @@ class Hall:
         self._has_rows_along_racks = True
 
     def _exhaust(self) -> Any:
-        """Temperatures that racks gave to the mixes in the last sweep, times strength, by place."""
+        """Return the racks' exhaust temperatures times strength in the last sweep, by place."""
         side = self._control["exhaust_side"]
         other_side = self._memory["exhaust_odd_c"], self._memory["exhaust_c"]
-        # Mostly all data centers have exchanged equally often.
+        # Usually all data centers have used the same side last.
         if np.minimum.reduce(side) == np.maximum.reduce(side):
             return other_side[side[0]]
         return np.where(np.repeat(side, LANES * self._places.blocks) == 0, *other_side)
 
     def _hall_state(self, server_c: Any) -> HallState:
-        """Thermal memory after the last substep."""
+        """Return the thermal state after the last substep."""
         return HallState(
             server_c=server_c,
             mixed_c=self._places.values_of_racks(self._memory["mixed_c"][None])[0],
@@ -555,25 +574,28 @@ class Hall:
         )
 
     def _aligned(self, shape: tuple[int, ...]) -> Any:
-        """Array of any content that kernels may take as vectors."""
+        """Return an uninitialised array that is aligned for vector access by kernels."""
         from sdc_taichi.kernels.compiler.arrays import aligned
 
         return aligned(shape, self._dtype)
 
     def _new_results(self) -> F64:
-        """Rows for the results of the data centers, and of racks whose former ones are in use."""
+        """Allocate result rows of the data centers, and of the racks if callers own the old rows.
+
+        Results of racks are returned without a copy if ``_returns_buffers`` is True.
+        """
         if self._returns_buffers:
             self._rack_out = self._aligned(self._rack_out.shape)
         return np.empty((len(DC_OUT), self._fleet.size))
 
     def _results(self, dc_out: F64, *, transient: bool) -> HallSums:
-        """Results of a step that has been done, after which layers can be shown."""
+        """Collect and check the results of a finished step, after which layers are available."""
         racks = self._rack_out.reshape(len(self._rack_out), -1)
         if not self._returns_buffers:
             racks = self._places.values_of_racks(racks)
         outlets_c = racks[_OUTLET_MAX_ROW]
         self.hottest_outlet_c = float(np.maximum.reduce(outlets_c))
-        # A NaN anywhere in a hall reaches its outlets.
+        # A NaN anywhere in a hall propagates to its outlets, so checking the outlets is enough.
         if not self.hottest_outlet_c < BEYOND_NUMBERS_C:
             raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient
@@ -590,6 +612,6 @@ class Hall:
 
 
 def _condition_shapes(fleet: Fleet) -> dict[str, tuple[int]]:
-    """Shape of each field of ``Conditions``."""
+    """Return the required shape of each field of ``Conditions``."""
     sizes = {"unit": fleet.units, "utilisation": fleet.size, "group": fleet.groups}
     return {f.name: (sizes.get(f.name.split("_")[0], fleet.racks),) for f in fields(Conditions)}
