@@ -1,9 +1,9 @@
 """HTML report of a run: one file with a summary, tables and pictures.
 
-The file holds everything it shows, styles and pictures as data, and no script; its content security
-policy forbids whatever would reach for the network. Equal runs give equal bytes, as
-docs/run-folder.md says. What grows with the number of data centers is limited: tables show the
-extremes, pictures a few chosen data centers.
+The file contains all its styles and pictures, has no scripts, and forbids network access by its
+content security policy. Equal runs give identical files, see docs/run-folder.md. The size of a
+report is bounded for large fleets: tables show extreme values, and pictures show a few data
+centers.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ KEY_METRICS = (
     ("hottest inlet", "hottest_inlet_c", "°C"),
     ("dropped work", "dropped_tasks", "tasks"),
 )
-"""Metrics at the head of the summary: label, name in metrics.json, unit."""
+"""Metrics at the top of the summary: label, name in metrics.json, unit."""
 LOSSES = {
     "throttled_rack_h": "Racks were throttled for {} rack h because of hot air.",
     "tripped_rack_h": "Racks were switched off for {} rack h because of hot air.",
@@ -65,9 +65,9 @@ LOSSES = {
     "grid_overload_kwh": "The grid connection carried {} kWh beyond its limit.",
     "unmet_cooling_kwh": "The plant lacked capacity for {} kWh of heat.",
 }
-"""Sentences about metrics that are zero in a run without trouble, by their names."""
+"""Sentences about failures and losses, keyed by metric; shown if the metric is above zero."""
 NAMED_SOURCES = 3
-"""Number of racks that are named with the warming by their exhaust."""
+"""Number of racks named in a row of the table of hot racks, as largest sources of exhaust."""
 INLET_HEADS = (
     "rack",
     "inlet (°C)",
@@ -79,10 +79,15 @@ INLET_HEADS = (
     "CRAC air that falls short (K)",
     "most from (K)",
 )
-"""Columns of the table of a hall with recirculation; the inlet is the sum of the four numbers that
-follow it."""
+"""Columns of the table of hot racks in a hall with recirculation.
+
+The inlet is the sum of the next four columns.
+"""
 APPROACH_HEADS = (*INLET_HEADS[:4], "approach temperature (K)")
-"""Columns of the table of a hall without recirculation; the inlet is the sum of the others."""
+"""Columns of the table of hot racks in a hall without recirculation.
+
+The inlet is the sum of the columns after it.
+"""
 
 
 def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
@@ -90,29 +95,30 @@ def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | N
 
     Args:
         run: the run, from ``read_run``.
-        others: runs to compare it with, of equal length.
-        out: the file; None is ``report.html`` in the run's folder, replaced if it exists.
+        others: runs of the same length, to compare the run with.
+        out: path of the file; None is ``report.html`` in the run's folder, which is replaced if it
+            exists.
 
     Returns:
-        The file.
+        Path of the written file.
 
     Raises:
         SdcError: matplotlib is missing, steps.parquet is damaged, the runs cannot be compared, or
             the file cannot be written.
     """
     target = run.path / REPORT_FILE if out is None else out
-    # Opened first, so that a place that cannot be written is known before the work.
+    # The file is opened first: an unwritable path must fail before the long computation.
     with atomic_write(target) as file:
         file.write(report_html(run, others).encode("utf-8", "replace"))
     return target
 
 
 def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
-    """The report of a run as text.
+    """Return the report of a run as an HTML page.
 
     Args:
         run: the run.
-        others: runs to compare it with, of equal length.
+        others: runs of the same length, to compare the run with.
 
     Raises:
         SdcError: matplotlib is missing, a file is damaged, or the runs cannot be compared.
@@ -145,7 +151,7 @@ def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
 
 
 def summary_section(run: RunFolder) -> str:
-    """Notices, key figures, the hottest inlet, where the work went, and what ran."""
+    """Return the section with notices, key figures, hottest inlet, task counts and run settings."""
     metrics, names = run.metrics, run.names
     total, done, asked = metrics["total"], metrics["steps_done"], metrics["steps_asked"]
     notices = [f"Note: {note}" for note in first_texts(metrics["notes"])]
@@ -183,7 +189,7 @@ def summary_section(run: RunFolder) -> str:
 
 
 def _hottest_inlet_text(run: RunFolder) -> str:
-    """Place and time of the hottest inlet, and how long the hall was too hot, in words."""
+    """Return a text about place and time of the hottest inlet, and the hours above the limit."""
     total = run.metrics["total"]
     where = total["hottest_dc"]
     dc = run.names.index(where)
@@ -200,7 +206,7 @@ def _hottest_inlet_text(run: RunFolder) -> str:
 
 
 def _work_texts(run: RunFolder) -> list[str]:
-    """Where work, stored energy and capacity went, in words."""
+    """Return sentences about the tasks, the battery, and the losses of a run."""
     total = run.metrics["total"]
     text = {key: metric_text(total, key) for key in total if key != "hottest_dc"}
     arrived = total["arrived_tasks"]
@@ -228,7 +234,7 @@ def _work_texts(run: RunFolder) -> list[str]:
 
 
 def events_section(run: RunFolder) -> str:
-    """Table of the failures, outages and heat waves of the run, of many the first ones."""
+    """Return the table of failures, outages and heat waves of a run, ``MAX_ROWS`` at most."""
     events = [
         (dc, event)
         for dc, about in enumerate(run.metrics["data_centers"])
@@ -258,7 +264,7 @@ def events_section(run: RunFolder) -> str:
 
 
 def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
-    """Why the hottest racks of some data centers are as hot as they are.
+    """Return the section that explains the inlet temperatures of the hottest racks.
 
     Args:
         run: the run.
@@ -291,7 +297,13 @@ def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
 
 
 def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
-    """Table of the hottest racks of a data center, and the state of the hottest in words."""
+    """Return the table of the hottest racks of a data center, and a text about the hottest rack.
+
+    Args:
+        run: the run.
+        dc: index of the data center.
+        hottest: inlets of the data center in the step of its hottest inlet.
+    """
     hall = hottest.config.hall
     recirculates = hall.inlet_model == "recirculation"
     racks = [hottest.inlets.parts(rack) for rack in hottest.inlets.hottest(HOTTEST_RACKS)]
@@ -310,7 +322,13 @@ def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
 
 
 def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) -> list[str]:
-    """Cells of one rack."""
+    """Return the cells of a rack in the table of the hottest racks.
+
+    Args:
+        parts: terms whose sum is the inlet temperature of the rack.
+        racks_per_row: number of racks in a row of the hall.
+        recirculates: True for columns ``INLET_HEADS``, False for ``APPROACH_HEADS``.
+    """
     temperatures = [parts.inlet_c, parts.setpoint_c, parts.warming_k]
     if recirculates:
         others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k + parts.lag_k
@@ -325,7 +343,7 @@ def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) ->
 
 
 def provenance_section(run: RunFolder) -> str:
-    """Source of every input, with the SHA-256 of files and the data centers that use it."""
+    """Return the table of input sources, file hashes, and the data centers that use each source."""
     users: dict[tuple[str, str, str], list[str]] = {}
     for dc in run.metrics["data_centers"]:
         sources, hashes = dc["provenance"], dc["sha256"]

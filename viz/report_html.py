@@ -1,6 +1,6 @@
-"""HTML of reports: page, tables, notices and pictures; texts of numbers, names and times.
+"""HTML elements of reports, and texts for numbers, names and times in them.
 
-The HTML comes from the template ``report.html``, which escapes every text.
+Most HTML comes from the Jinja template ``report.html``, which escapes every text.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PICTURE_DPI = 110
-"""Resolution of the pictures, in pixels per inch."""
+"""Resolution of pictures in reports, in pixels per inch."""
 LONG_WORD = 24
-"""Length from which words of a table, such as names and hashes, may be broken on paper."""
+"""Smallest length of words in a table, such as hashes, that may be broken when printed."""
 DASH = "–"
-"""Text of a cell without a value."""
+"""Text of a table cell without a value."""
 MAX_ROWS = 40
-"""Largest number of rows of a list that grows with the run: events, sources, notes."""
+"""Largest number of rows of tables and lists of events, sources and notes."""
 NAMES_PER_CELL = 6
-"""Largest number of data centers that a cell names."""
+"""Largest number of data centers named in a table cell."""
 
 
 @cache
 def _macros() -> Any:
-    """Macros of the template by name."""
+    """Load the template ``report.html``, and return the module of its macros."""
     try:
         import jinja2
     except ImportError as error:
@@ -54,24 +54,24 @@ def _macros() -> Any:
 
 
 def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[str]) -> str:
-    """The whole page.
+    """Return the complete HTML page of a report.
 
     Args:
-        title: title and heading.
-        lead: text below the heading.
-        sections: from the heading of each section to its HTML.
-        own_page: headings of the sections that begin a new page on paper.
+        title: title and main heading of the page.
+        lead: text below the main heading.
+        sections: HTML of each section, keyed by its heading.
+        own_page: headings of the sections that begin a new page when printed.
     """
     page = str(_macros().page(title, lead, sections, own_page))
     return "\n".join(map(printable, page.split("\n")))
 
 
 def picture_element(figure: Figure, alt: str, caption: str) -> str:
-    """A figure with its caption, the picture as data in it.
+    """Return an HTML figure with a caption, which contains the picture as a data URL.
 
     Args:
         figure: the picture.
-        alt: what the picture shows, for readers who do not see it.
+        alt: description of the picture for readers who cannot see it.
         caption: text below the picture.
     """
     width, height, data = webp(figure, PICTURE_DPI)
@@ -86,66 +86,66 @@ def html_table(
     numbers: Iterable[int] = (),
     groups: Mapping[str, Sequence[Sequence[str]]] | None = None,
 ) -> str:
-    """A table whose rows are headed by their first cell.
+    """Return an HTML table in which the first cell of each row is the head of the row.
 
     Args:
         caption: text above the table.
-        heads: heads of the columns; None is a table of two columns without heads.
-        rows: texts of each row.
-        numbers: indices of the columns of numbers, which are aligned to the right.
-        groups: further rows, by the title of their group.
+        heads: heads of the columns; None for a table of two columns without heads.
+        rows: cell texts of each row.
+        numbers: indices of columns of numbers, which are aligned to the right.
+        groups: further rows, keyed by the title of their group.
     """
     titled = ([("", rows)] if rows else []) + list((groups or {}).items())
     return str(_macros().table(caption, heads, titled, set(numbers)))
 
 
 def paragraph(text: str) -> str:
-    """A paragraph."""
+    """Return an HTML paragraph."""
     return f"<p>{escape(text)}</p>\n"
 
 
 def notice(text: str) -> str:
-    """A paragraph that stands out."""
+    """Return a highlighted HTML paragraph."""
     return f'<p class="notice" role="note">{escape(text)}</p>\n'
 
 
 def bullets(texts: Iterable[str]) -> str:
-    """A list of texts."""
+    """Return an HTML list of texts."""
     return str(_macros().bullets(texts))
 
 
 def key_figures(figures: Iterable[tuple[str, str]]) -> str:
-    """Labels and figures in boxes beside each other."""
+    """Return HTML boxes side by side, each with a label and a figure."""
     return str(_macros().key_figures(figures))
 
 
 def folded(summary: str, text: str) -> str:
-    """A long text that readers can unfold."""
+    """Return a folded HTML element, which shows a long text when unfolded."""
     return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>\n"
 
 
 def metric_text(metrics: Mapping[str, Any], key: str) -> str:
-    """A metric as text, a dash where it is not known or not defined."""
+    """Return the value of a metric as text, or a dash if it is unknown or undefined."""
     value = metrics.get(key)
     return DASH if value is None else format_number(value)
 
 
 def names_text(names: Sequence[str]) -> str:
-    """The first few names, and how many more there are."""
+    """Return the first ``NAMES_PER_CELL`` names, and the number of further names."""
     if len(names) <= NAMES_PER_CELL:
         return ", ".join(names)
     return f"{', '.join(names[:NAMES_PER_CELL])} and {len(names) - NAMES_PER_CELL:,} more"
 
 
 def first_texts(texts: Sequence[str]) -> list[str]:
-    """The first texts of a list, and how many more there are."""
+    """Return the first ``MAX_ROWS`` texts, and a text with the number of further ones."""
     if len(texts) <= MAX_ROWS:
         return list(texts)
     return [*texts[:MAX_ROWS], f"and {len(texts) - MAX_ROWS} more, see {METRICS_FILE}"]
 
 
 def local_time(run: RunFolder, dc: int, step: int) -> datetime:
-    """Time at which a step begins on the clock of a data center.
+    """Return the time at which a step begins, on the clock of a data center.
 
     Args:
         run: the run.
@@ -160,18 +160,18 @@ def local_time(run: RunFolder, dc: int, step: int) -> datetime:
 
 
 def time_text(run: RunFolder, moment: datetime) -> str:
-    """Day and time of day, with the year of the run if it is longer than a year."""
+    """Return day and time of day as text, with the number of the year in runs over a year."""
     day = date_text(moment, over_a_year=run.hours > HOURS_PER_YEAR)
     return f"{day} {moment:%H:%M}"
 
 
 def count_text(value: float, noun: str) -> str:
-    """A number and a noun, in the plural unless the number is 1."""
+    """Return a number and a noun, with a plural "s" unless the number is 1."""
     return f"{format_number(value)} {noun}" + ("" if value == 1 else "s")
 
 
 def time_span_text(run: RunFolder) -> str:
-    """Data centers, length, begin and end of a run in words."""
+    """Return a text with number of data centers, length, begin and end of a run."""
     begin, last = local_time(run, 0, 0), local_time(run, 0, run.metrics["steps_done"])
     size, length = count_text(len(run.names), "data center"), count_text(run.hours / 24, "day")
     span = f"{time_text(run, begin)} to {time_text(run, last)}, local standard time"
@@ -179,7 +179,7 @@ def time_span_text(run: RunFolder) -> str:
 
 
 def run_labels(runs: Sequence[RunFolder]) -> list[str]:
-    """Names of runs: their controllers, with their folders where controllers are equal."""
+    """Return distinct labels of runs: the controller, plus folder and number if necessary."""
     names = [run.metrics["controller"] for run in runs]
     if len(set(names)) < len(names):
         names = [f"{n} ({run.path.resolve().name})" for n, run in zip(names, runs, strict=True)]

@@ -1,4 +1,4 @@
-"""Tables of metrics in a report: all metrics, the ranking of data centers, runs compared."""
+"""Tables of metrics in a report: all metrics, ranking of data centers, comparison of runs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .report_html import (
 )
 
 MAX_DC_COLUMNS = 6
-"""Largest number of data centers with a column each."""
+"""Largest number of data centers with one column each in the table of metrics."""
 COMPARED_PER_TABLE = 4
-"""Runs beside the first in one table, as many as a page holds."""
+"""Largest number of runs, besides the first, in a comparison table; more do not fit a page."""
 WORST_RANKS, BEST_RANKS = 5, 3
-"""Number of data centers in the ranking from the worst and from the best."""
+"""Number of worst and of best data centers in the ranking."""
 
 METRICS = (
     (
@@ -98,7 +98,10 @@ METRICS = (
         ),
     ),
 )
-"""Groups of metrics, and of each metric: its name in metrics.json, what it is, unit."""
+"""Groups of metrics in the order of the table.
+
+Each group has a title and its metrics: name in metrics.json, label, unit.
+"""
 
 COMPARED = (
     *(key for key, *_ in RADAR_METRICS),
@@ -113,16 +116,19 @@ COMPARED = (
     "hottest_inlet_c",
     "inlet_above_27_h",
 )
-"""Names of the metrics by which runs are compared."""
+"""Names of the metrics in the comparison of runs."""
 
 RANKED = ("hottest_inlet_c", "pue", "cue_kg_per_kwh", "wue_l_per_kwh", "dropped_tasks")
-"""Names of the metrics by which data centers are ranked; more is worse."""
+"""Names of the metrics in the ranking of data centers; larger values are worse."""
 LABELS = {key: (label, unit) for _, group in METRICS for key, label, unit in group}
-"""Label and unit of each metric by its name."""
+"""Label and unit of each metric, keyed by its name."""
 
 
 def metrics_section(run: RunFolder) -> str:
-    """All metrics, with a column for each of a few data centers, or with their range."""
+    """Return the table of all metrics, and a ranking of the data centers if there are many.
+
+    The table has one column per data center, or for many data centers their range.
+    """
     dcs, total = run.metrics["data_centers"], run.metrics["total"]
     are_few, are_several = len(dcs) <= MAX_DC_COLUMNS, len(dcs) > 1
     columns = [dc["name"] for dc in dcs] if are_few else ["lowest", "mean", "highest"]
@@ -150,7 +156,7 @@ def metrics_section(run: RunFolder) -> str:
 
 
 def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
-    """The worst and the best data centers by each of a few metrics."""
+    """Return the table of the worst and the best data centers in each metric of ``RANKED``."""
     ranked = {key: sorted(_values(dcs, key), key=lambda pair: -pair[0]) for key in RANKED}
     groups = {}
     for group, count, order in (("worst", WORST_RANKS, 1), ("best", BEST_RANKS, -1)):
@@ -162,23 +168,34 @@ def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
 
 
 def _values(dcs: Sequence[dict[str, Any]], key: str) -> list[tuple[float, str]]:
-    """Values of a metric with the names of the data centers that have one."""
+    """Return the value of a metric and the data center's name, for data centers with a value."""
     pairs = [(dc["metrics"].get(key), dc["name"]) for dc in dcs]
     return [pair for pair in pairs if pair[0] is not None]
 
 
 def _rank_texts(pairs: Sequence[tuple[float, str]], count: int) -> list[str]:
-    """The first pairs of a value and a name as texts; equal values are not ranked."""
+    """Return the first pairs of value and name as texts, padded with dashes.
+
+    If all values are equal, there is no ranking, and the first text says so.
+
+    Args:
+        pairs: values and names of data centers, in the order of the ranking.
+        count: number of texts.
+    """
     if pairs and pairs[0][0] == pairs[-1][0]:
         texts = [f"all {format_number(pairs[0][0])}"]
     else:
-        # A space that does not break: a value alone on a line reads as another entry.
+        # The no-break space keeps name and value on one line; otherwise the value alone on a line
+        # looks like another entry.
         texts = [f"{name}:\u00a0{format_number(value)}" for value, name in pairs[:count]]
     return texts + [DASH] * (count - len(texts))
 
 
 def _range(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
-    """Lowest, mean and highest value of a metric as texts, the extremes with a data center."""
+    """Return minimum, mean and maximum of a metric over the data centers, as texts.
+
+    Minimum and maximum include the name of their data center.
+    """
     values = _values(dcs, key)
     if not values:
         return [DASH] * 3
@@ -192,14 +209,15 @@ def _range(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
 def comparison_section(
     runs: Sequence[RunFolder], shares: Sequence[float | None] | None = None
 ) -> str:
-    """Runs against the first one: metrics, their changes, and a radar of five.
+    """Return the comparison of runs with the first run: tables of metrics, and a radar chart.
 
     Args:
         runs: the runs.
-        shares: share of the achievable of each run, None where unknown; None without an optimum.
+        shares: share of the achievable of each run, or None if it is unknown; None for all runs
+            if there is no optimum.
 
     Raises:
-        SdcError: runs of other length than the first one, or too many.
+        SdcError: the runs have different lengths, or there are too many.
     """
     first, labels = runs[0], run_labels(runs)
     for run in runs[1:]:
@@ -245,14 +263,19 @@ def comparison_section(
 def _comparison_table(
     totals: Mapping[str, Mapping[str, Any]], share_of: Mapping[str, float | None] | None
 ) -> str:
-    """Metrics of some runs by label, and their changes against the first one."""
+    """Return a table of metrics of several runs, with changes relative to the first run.
+
+    Args:
+        totals: metrics of each run over all data centers, keyed by the label of the run.
+        share_of: share of the achievable of each run, keyed by label; None without an optimum.
+    """
     base, *_ = totals.values()
     rows = []
     for key in COMPARED:
         cells = [*LABELS[key], metric_text(base, key)]
         for total in list(totals.values())[1:]:
             text = metric_text(total, key)
-            # A temperature has no zero to be a share of.
+                # Temperatures have no relative change, because their zero is arbitrary.
             if base.get(key) and total.get(key) is not None and not key.endswith("_c"):
                 text += f" ({100 * (total[key] / base[key] - 1):+z.2f} %)"
             cells.append(text)

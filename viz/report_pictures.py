@@ -1,4 +1,4 @@
-"""Sections of a report with pictures: data centers, inputs, and a known optimum."""
+"""Sections of a report with pictures: fleet, data centers, inputs, and a known optimum."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_SHOWN_DCS = 4
-"""Largest number of data centers of which all have pictures."""
+"""Largest number of data centers that all have pictures; larger fleets show extreme ones."""
 YEAR_FROM_H = 48.0
-"""Length of a run from which it is drawn by day and hour, in h."""
+"""Shortest run that is drawn as heat maps by day and hour, in h."""
 
 
 _SAVED = {
@@ -52,27 +52,30 @@ _SAVED = {
     "cost": "energy_cost",
     "water": "water_l",
 }
-"""Column of steps.parquet that measures each objective, by which a day is chosen."""
+"""Column of steps.parquet that measures each objective of an optimum.
+
+The pictures show the day with the largest saving in this column.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class ShownDataCenter:
-    """A data center with pictures of its own."""
+    """A data center with its own section of pictures in a report."""
 
     index: int
-    """Index of the data center."""
+    """Index of the data center in the fleet."""
     reason: str
-    """Why it is shown, in words; empty if all are."""
+    """Reason for showing the data center, as text; empty if all data centers are shown."""
     steps: pd.DataFrame
-    """Rows that it has in steps.parquet."""
+    """Rows of steps.parquet of the data center."""
     racks: pd.DataFrame
-    """Its racks over the run, as ``read_racks`` returns them."""
+    """Statistics of each rack over the run, as ``read_racks`` returns them."""
     config: DataCenterConfig
-    """Its config."""
+    """Config of the data center."""
 
 
 def fleet_section(run: RunFolder) -> str:
-    """All data centers together, and which halls ran hot when."""
+    """Return the section of the whole fleet: sums over the run, and hottest inlets over time."""
     fleet = read_fleet_steps(run)
     count = len(run.names)
     powers_kw = (fleet.series["it_w"] + fleet.series["overhead_w"]).to_numpy() / 1e3
@@ -103,7 +106,7 @@ def fleet_section(run: RunFolder) -> str:
 
 
 def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
-    """The data centers with pictures: all of a few, else those with extreme metrics."""
+    """Return the data centers with pictures: all in small fleets, or those with extreme metrics."""
     dcs = run.metrics["data_centers"]
     if len(dcs) <= MAX_SHOWN_DCS:
         reasons = dict.fromkeys(range(len(dcs)), "")
@@ -116,7 +119,7 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
             ("cue_kg_per_kwh", min, "least carbon per IT energy"),
         ):
             known = [i for i, dc in enumerate(dcs) if dc["metrics"][key] is not None]
-            # Equal values single out no data center.
+            # If a metric has the same value in all data centers, none of them is extreme.
             if len({dcs[i]["metrics"][key] for i in known}) > 1:
                 dc = best(known, key=lambda i: dcs[i]["metrics"][key])
                 reasons[dc] = f"{reasons[dc]}, {text}" if dc in reasons else f"it has the {text}"
@@ -130,7 +133,7 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
 
 
 def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
-    """A data center in words and pictures, with its config."""
+    """Return the section of a data center: text, pictures and config."""
     steps, hall = dc.steps, dc.config.hall
     parts = [paragraph(f"Shown because {dc.reason} of {len(run.names):,}.")] if dc.reason else []
     location = run.metrics["data_centers"][dc.index]["location"]
@@ -156,12 +159,12 @@ def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
 
 
 def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str) -> str:
-    """Pictures of one data center.
+    """Return the pictures of one data center.
 
     Args:
         run: the run.
         dc: the data center.
-        hottest_text: its hottest inlet in words.
+        hottest_text: temperature and time of the hottest inlet of the data center, as text.
     """
     name, steps = run.names[dc.index], dc.steps
     out = [_hot_racks_picture(run, dc), _whole_run_picture(run, name, steps)]
@@ -199,7 +202,7 @@ def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str
 
 
 def _hot_racks_picture(run: RunFolder, dc: ShownDataCenter) -> str:
-    """How long each rack had the hottest inlet."""
+    """Return the picture of how long each rack had the hottest inlet of its hall."""
     name, hall = run.names[dc.index], dc.config.hall
     hours = dc.racks["hottest_h"].to_numpy()
     row, rack = divmod(int(hours.argmax()), hall.racks_per_row)
@@ -216,7 +219,7 @@ def _hot_racks_picture(run: RunFolder, dc: ShownDataCenter) -> str:
 
 
 def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
-    """Day-by-hour maps, or a step plot; empty for runs up to one day."""
+    """Return heat maps by day and hour, or a step plot for short runs; empty up to one day."""
     if run.hours >= YEAR_FROM_H:
         return picture_element(
             dashboards.year(steps, name),
@@ -234,7 +237,7 @@ def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
 
 
 def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
-    """Weather, carbon intensity and work as the run read them."""
+    """Return the section of pictures of the inputs: weather, carbon intensity and workload."""
     names = [run.names[dc.index] for dc in shown]
     origin = "as the run read them" + (", SYNTHETIC in part" if run.metrics["synthetic"] else "")
     out = []
@@ -254,7 +257,7 @@ def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
                 f"{label}, {origin}.",
             )
         )
-        # A day without emissions has no relative variation.
+        # The relative variation of a day is undefined if the mean carbon intensity of it is zero.
         has_means = all(data_figures.daily(values).mean().min() > 0 for values in series.values())
         if column == "ci_g_per_kwh" and has_means and len(series) > 1:
             out.append(
@@ -269,7 +272,7 @@ def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
 
 
 def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dict[str, pd.Series]:
-    """Series by name; data centers with equal series share one.
+    """Return series keyed by the names of data centers, joined if their series are equal.
 
     Args:
         names: names of the data centers.
@@ -287,19 +290,21 @@ def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dic
 
 @dataclass(frozen=True, slots=True)
 class KnownOptimum:
-    """An optimum of the inputs of a run."""
+    """A known optimum for the inputs of a run."""
 
     run: RunFolder
-    """Run folder of the achieved path."""
+    """Run folder of the simulation that reached the optimum's achieved figure."""
     content: Mapping[str, Any]
     """Content of optimum.json."""
 
 
 def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
-    """An optimum of the inputs and steps of the first of some runs, in the folder of any of them.
+    """Return an optimum for the inputs and steps of the first run, or None if there is none.
+
+    The optimum may be in the folder of any of the runs.
 
     Raises:
-        SdcError: an optimum that is damaged.
+        SdcError: an optimum is damaged, or is for other data centers or steps.
     """
     first = runs[0].metrics
     for run in runs:
@@ -315,11 +320,11 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
 
 
 def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]) -> str:
-    """Table of an optimum, and the day on which it saves most beside that day of the run.
+    """Return the section of an optimum: its table, and pictures of the day of largest saving.
 
     Args:
         run: the run.
-        optimum: an optimum of its inputs.
+        optimum: an optimum for the inputs of the run.
         shown: data centers with pictures.
     """
     content = optimum.content
@@ -332,14 +337,16 @@ def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[Shown
 
 
 def share_of(run: RunFolder, optimum: KnownOptimum) -> float | None:
-    """Share of the achievable of a run; None where its files do not determine it.
+    """Return the share of the achievable of a run, or None if its files do not determine it.
 
-    Where metrics.json does not hold it, a run that ends with no work waiting and has not used the
-    battery ends as it began, so its share follows from its figure.
+    The share is 0 for idle commands and 1 for the achieved path of the optimum. If metrics.json
+    does not contain the share, it is computed from the metrics of the run, provided that the run
+    ends with an empty queue and has not used the battery. Other runs end in a state whose value
+    would have to be included.
 
     Args:
         run: the run.
-        optimum: an optimum, which may be of other inputs.
+        optimum: an optimum, possibly for other inputs.
     """
     content = optimum.content
     if run.metrics["fingerprint"] != content["fingerprint"]:
@@ -364,7 +371,15 @@ def share_of(run: RunFolder, optimum: KnownOptimum) -> float | None:
 
 
 def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Entry of metrics.json about an optimum of this objective, agents and steps, if any."""
+    """Return the entry ``optimum`` of a run's metrics.json if it is about the same optimum.
+
+    None means that there is no such entry, or that it has another objective, other agents or
+    another first scored step.
+
+    Args:
+        run: the run.
+        content: content of optimum.json.
+    """
     entry = run.metrics.get("optimum")
     if entry is None:
         return None
@@ -373,7 +388,7 @@ def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, 
 
 
 def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
-    """Figures of each data center and of all."""
+    """Return the table of figures of an optimum, for each data center and for all together."""
     controllers, dcs = content["controllers"], content["data_centers"]
     beside = _beside_optimum(run, content) is not None
     heads = ["data center", "idle", "bound", "achieved", "gap (points)"]
@@ -410,12 +425,21 @@ def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
 
 
 def _percent(share: Any) -> float | None:
-    """A share in %."""
+    """Convert a share to %, or return None if it is not a number."""
     return 100.0 * share if is_number(share) else None
 
 
 def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> str:
-    """The day on which the optimum saves most against the run, of one data center."""
+    """Return the picture of the day on which the optimum saves most against the run.
+
+    If the run is that of the optimum, the picture shows the day on which the battery moves most
+    energy.
+
+    Args:
+        run: the run.
+        optimum: an optimum for the inputs of the run.
+        dc: the data center.
+    """
     name = run.names[dc.index]
     objective = str(optimum.content["objective"])
     saving = objective if objective in _SAVED else "carbon"
