@@ -1,4 +1,4 @@
-"""The public names, each imported from its module on first use."""
+"""Public names of the package; each is imported from its module on first use."""
 
 from .config import DataCenterConfig as DataCenterConfig
 from .config import load_config as load_config

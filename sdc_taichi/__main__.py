@@ -1,19 +1,20 @@
-"""The program ``sdc-taichi``, which is ``python -m sdc_taichi`` as well."""
+"""Entry point of the program ``sdc-taichi``, which ``python -m sdc_taichi`` also starts."""
 
 import os
 import signal
 
 
 def main() -> None:
-    """Run the command line of this process, and exit."""
+    """Run the command that this process was started with, and exit."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Commands take a good part of a second to import, during which an exception may be lost
-        # or replaced by another. 130 is the exit code of a program that Ctrl-C ended.
+        # During imports, which take a good part of a second, a KeyboardInterrupt may be lost or
+        # replaced by another exception, so Ctrl-C ends the process directly. Its exit code 130 is
+        # the usual one after Ctrl-C.
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))
         from sdc_taichi.cli import app
 
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    else:  # a shell's background job, which ignores Ctrl-C
+    else:  # a background job of a shell, which ignores Ctrl-C
         from sdc_taichi.cli import app
     app.main()
 

@@ -1,4 +1,4 @@
-"""Files that appear under their name only when they are whole, written by one process at a time."""
+"""Atomic writing: a file gets its name only when complete, and has one writer at a time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sdc_taichi.errors import SdcError
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where a file that is open cannot be deleted
+except ImportError:  # on Windows, where an open file cannot be deleted
     fcntl = None  # type: ignore[assignment]
 
 _SUFFIX = ".part"
@@ -21,10 +21,10 @@ _SUFFIX = ".part"
 
 @contextlib.contextmanager
 def naming_errors(path: Path) -> Iterator[None]:
-    """Turn a failure of the file system into an error that names the file.
+    """Convert an ``OSError`` of the block into an error whose message names the file.
 
     Raises:
-        SdcError: in place of an OSError.
+        SdcError: the block raised an ``OSError``.
     """
     try:
         yield
@@ -33,23 +33,23 @@ def naming_errors(path: Path) -> Iterator[None]:
 
 
 class ClaimedFileError(SdcError):
-    """Another process, or another part of this one, is writing a file."""
+    """Another process, or another part of this process, is writing the file."""
 
 
 class FileClaim:
-    """The right to write a file, which one process has at a time.
+    """Exclusive right to write a file, which only one process can have at a time.
 
-    The claim is a hidden file, ``.NAME.part``, beside the file to be written, which is open and
-    locked. The system frees the lock when the process ends, for any reason; the next writer takes
-    over the hidden file. On a file system without locks several processes can write at a time, and
-    the last one to end determines the content.
+    The claim opens and locks a hidden file, ``.NAME.part``, in the folder of the file. The
+    operating system releases the lock when the process ends, even after a crash; the next writer
+    then reuses the hidden file. On a file system without locks, several processes can write at the
+    same time, and the content is that of the last one to finish.
 
     Args:
-        path: the file that is to be written.
+        path: path of the file to write.
 
     Raises:
-        ClaimedFileError: another process, or another part of this one, is writing it.
-        SdcError: nothing can be written there.
+        ClaimedFileError: another process, or another part of this process, is writing the file.
+        SdcError: no file can be written at the path.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +57,7 @@ class FileClaim:
         self._part = path.with_name(f".{path.name}{_SUFFIX}")
         with naming_errors(path):
             try:
-                opened = _open_alone(self._part)
+                opened = _open_exclusively(self._part)
             except _NoLocksError:
                 self._part = path.with_name(f".{path.name}.{os.getpid()}{_SUFFIX}")
                 opened = self._part.open("wb")
@@ -69,14 +69,17 @@ class FileClaim:
         self.file: IO[bytes] = opened
         """The hidden file, empty and open for writing."""
         self.release = weakref.finalize(self, _delete, self.file, self._part, os.getpid())
-        """Deletes the hidden file; without effect after ``rename``, or when called again. Happens
-        by itself when the claim is forgotten and when the process ends."""
+        """Function that ends the claim and deletes the hidden file.
+
+        It is called automatically when the claim is garbage-collected or the process ends. It has
+        no effect after ``rename``, or when called again.
+        """
 
     def rename(self) -> None:
-        """Give the hidden file its name, once its content is on the disk, and end the claim.
+        """Flush the hidden file to disk, rename it to the claimed name, and end the claim.
 
         Raises:
-            OSError: the file system refuses.
+            OSError: the file cannot be flushed or renamed.
         """
         self.file.flush()
         os.fsync(self.file.fileno())
@@ -88,13 +91,14 @@ class FileClaim:
 
 
 class AtomicFile:
-    """A file open for writing; readers see the old one until ``commit`` and the new one after.
+    """File open for writing, which replaces an existing file only on ``commit``.
 
-    As a context manager it discards what was not committed.
+    Until then, readers see the old content. Leaving the context manager without ``commit``
+    discards the new content.
 
     Args:
-        path: the name that the file gets on ``commit``.
-        parents: also create the folders it lies in.
+        path: path that the file gets on ``commit``.
+        parents: True to create missing parent folders.
 
     Raises:
         SdcError: the file cannot be opened, or another process is writing it.
@@ -110,7 +114,7 @@ class AtomicFile:
         """The file, open for writing."""
 
     def commit(self) -> None:
-        """Close the file and give it its name, once its content is on the disk.
+        """Flush the file to disk, close it, and give it its final name.
 
         Raises:
             SdcError: the file cannot be written.
@@ -119,7 +123,7 @@ class AtomicFile:
             self._claim.rename()
 
     def discard(self) -> None:
-        """Close the file and delete what was written; without effect after ``commit``."""
+        """Close the file and delete the new content; this has no effect after ``commit``."""
         self._claim.release()
 
     def __enter__(self) -> Self:
@@ -134,8 +138,11 @@ def atomic_write(path: Path, *, parents: bool = False) -> Iterator[IO[bytes]]:
     """Open a file for writing that replaces ``path`` when the block ends without an error.
 
     Args:
-        path: the file.
-        parents: also create the folders it lies in.
+        path: path of the file.
+        parents: True to create missing parent folders.
+
+    Yields:
+        The file, open for writing bytes.
 
     Raises:
         SdcError: the file cannot be written, or another process is writing it.
@@ -147,15 +154,15 @@ def atomic_write(path: Path, *, parents: bool = False) -> Iterator[IO[bytes]]:
 
 
 class _NoLocksError(Exception):
-    """The file system locks no files."""
+    """The file system does not support file locks."""
 
 
-def _open_alone(part: Path) -> IO[bytes] | None:
-    """Open the hidden file of a claim, and empty it; None while another claim holds it.
+def _open_exclusively(part: Path) -> IO[bytes] | None:
+    """Open, lock and empty the hidden file of a claim; return None if another claim has it.
 
     Raises:
-        OSError: it cannot be opened.
-        _NoLocksError: it cannot be locked; it is deleted.
+        OSError: the file cannot be opened.
+        _NoLocksError: the file cannot be locked, and was deleted.
     """
     if fcntl is None:
         try:
@@ -175,7 +182,8 @@ def _open_alone(part: Path) -> IO[bytes] | None:
             file.close()
             part.unlink(missing_ok=True)
             raise _NoLocksError from None
-        # Renamed or deleted by the former owner since it was opened here.
+        # The file's previous owner may have renamed or deleted it between opening and locking here.
+        # In that case the path has another inode or none, and the loop tries again.
         with contextlib.suppress(FileNotFoundError):
             if part.stat().st_ino == os.fstat(file.fileno()).st_ino:
                 file.truncate(0)
@@ -184,7 +192,13 @@ def _open_alone(part: Path) -> IO[bytes] | None:
 
 
 def _delete(file: IO[bytes], part: Path, owner: int) -> None:
-    """Close and delete the hidden file of a claim, unless this is a child of its owner."""
+    """Close and delete the hidden file of a claim, unless this is a forked child process.
+
+    Args:
+        file: the open hidden file.
+        part: path of the hidden file.
+        owner: id of the process that made the claim.
+    """
     if os.getpid() != owner:
         return
     if fcntl is not None:

@@ -1,6 +1,7 @@
-"""Errors a user can cause; every message names the place, the value and what would be valid.
+"""Errors caused by invalid input, and warnings.
 
-What a user should know while the work continues is an ``SdcWarning``.
+Every error message names the place, the value, and what would be valid. An ``SdcWarning`` reports
+a problem after which the work continues.
 """
 
 from __future__ import annotations
@@ -10,16 +11,17 @@ from collections.abc import Iterable
 from numbers import Integral
 
 MOST_CHARACTERS = 800
-"""Length of the longest message; the middle of a longer one is left out."""
+"""Largest length of a message in characters; the middle of a longer one is cut out."""
 
 
 def printable(text: object) -> str:
-    """Text that is safe to print: control characters, which a terminal obeys, are escaped.
+    """Return a text that is safe to print on a terminal.
 
-    So are characters that change the direction of writing, and other invisible ones.
+    Control characters, characters that change the direction of writing, and other invisible
+    characters are escaped.
 
     Args:
-        text: what is to be printed, such as the name of a file.
+        text: the text or object to print, such as the name of a file.
     """
     whole = str(text)
     if whole.isprintable():
@@ -31,7 +33,7 @@ def printable(text: object) -> str:
 
 
 def one_line(text: str) -> str:
-    """Text of a message on one line of bounded length that is safe to print."""
+    """Return a message as one printable line of at most about ``MOST_CHARACTERS`` characters."""
     line = printable(" ".join(text.split()))
     if len(line) > MOST_CHARACTERS:
         half = MOST_CHARACTERS // 2
@@ -40,11 +42,12 @@ def one_line(text: str) -> str:
 
 
 class SdcError(ValueError):
-    """Base of all errors caused by input; the command line prints them without a traceback.
+    """Base class of all errors caused by input; commands print them without a traceback.
 
     Args:
-        message: place, value, and what would be valid, which ``one_line`` shortens; or an error,
-            from which Gymnasium rebuilds errors of worker processes.
+        message: text that names the place, the value and what would be valid, which ``one_line``
+            shortens. It may be an exception, because Gymnasium passes one to re-raise an error of
+            a worker process.
     """
 
     def __init__(self, message: object) -> None:
@@ -60,34 +63,34 @@ class DataError(SdcError):
 
 
 class PhysicalLimitError(SdcError):
-    """A result is beyond what any data center can reach, which points to a meaningless input."""
+    """A result is physically impossible for a data center, because of a meaningless input."""
 
 
 class RuntimeStateError(SdcError):
-    """The simulator was used in a state that cannot work (closed, forked, not reset)."""
+    """The simulator is in a state in which it cannot run: closed, forked, or not reset."""
 
 
 class SdcWarning(UserWarning):
-    """Base of all warnings of the package; the command line prints each as one line."""
+    """Base class of all warnings of the package; commands print each as one line."""
 
 
 class OddInputWarning(SdcWarning):
-    """An input is possible, but probably not what was meant."""
+    """An input is valid, but probably not what the user intended."""
 
 
 def whole_number(what: str, value: object, low: int, high: int) -> int:
-    """A whole number of Python or NumPy that was given as an argument.
+    """Check an integer argument, and return it as a Python ``int``.
 
     Args:
         what: name of the argument, for the message.
-        value: what was given.
-        low: least valid value.
+        value: the argument, an integer of Python or NumPy.
+        low: smallest valid value.
         high: largest valid value.
 
     Raises:
-        ConfigError: no whole number, or one out of bounds.
+        ConfigError: the value is not an integer, or out of bounds.
     """
-    # NumPy's whole numbers are registered as integral.
+    # NumPy registers its integer types as Integral.
     if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
         raise ConfigError(
             f"{what} {shortened(value)}: valid is a whole number of {low:,}..{high:,}"
@@ -96,23 +99,23 @@ def whole_number(what: str, value: object, low: int, high: int) -> int:
 
 
 def shortened(value: object, most: int = 80) -> str:
-    """A value as messages quote it, cut to a number of characters.
+    """Return the ``repr`` of a value for a message, cut to a number of characters.
 
     Args:
-        value: any value; its ``repr`` is quoted.
-        most: number of characters after which it is cut.
+        value: any value.
+        most: largest number of characters before the cut.
     """
     text = repr(value[: most + 1] if isinstance(value, str | bytes | list | tuple) else value)
     return text if len(text) <= most else text[:most] + "…"
 
 
 def similar_names(name: object, valid: Iterable[str], most: int = 1) -> list[str]:
-    """Valid names that a misspelt ``name`` may have meant, the most similar first.
+    """Return valid names that resemble a misspelt name, most similar first.
 
     Args:
-        name: what was given; compared without regard to case.
-        valid: the names to choose from.
-        most: at most this many are returned.
+        name: the unknown name; upper and lower case are equal.
+        valid: the valid names.
+        most: largest number of returned names.
     """
     by_folded = {x.casefold(): x for x in valid}
     near = difflib.get_close_matches(str(name).strip().casefold(), by_folded, most, cutoff=0.5)
@@ -120,21 +123,21 @@ def similar_names(name: object, valid: Iterable[str], most: int = 1) -> list[str
 
 
 def suggestion(name: object, valid: Iterable[str], text: str = "; did you mean {!r}?") -> str:
-    """End of a message about an unknown name: the most similar valid name.
+    """Return the end of a message about an unknown name, which suggests a similar valid name.
 
     Args:
-        name: what was given.
-        valid: the names to choose from.
+        name: the unknown name.
+        valid: the valid names.
         text: format of the suggestion, with one placeholder for the name.
 
     Returns:
-        The text; empty if no valid name is similar.
+        The formatted suggestion; empty if no valid name is similar.
     """
     near = similar_names(name, valid)
     return text.format(near[0]) if near else ""
 
 
 def suggestion_or_valid(name: object, valid: Iterable[str]) -> str:
-    """End of a message about an unknown name: the most similar valid name, or all valid names."""
+    """Return the end of a message about an unknown name: a similar name, or all valid names."""
     names = list(valid)
     return suggestion(name, names) or f"; valid: {', '.join(names)}"

@@ -1,7 +1,7 @@
-"""Numbers that users write: plain decimal ones in ASCII, as in every file format read here.
+"""Parsers of numbers in the input of users, which accept plain decimal numbers in ASCII only.
 
-Python's own ``float`` and ``int`` also read ``1_000``, ``infinity`` and the digits of other
-scripts, and ``str.isdigit`` is true of ``²``, which neither of them reads.
+They are stricter than Python's ``float`` and ``int``, which also accept ``1_000``, ``infinity`` and
+digits of other scripts. ``str.isdigit`` is no substitute, because it is true for ``²``.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import re
 from sdc_taichi.errors import shortened
 
 MOST_DIGITS = 300
-"""Largest number of digits of a whole number; a float holds as many."""
+"""Largest number of digits of an integer, so that the integer is in the range of a float."""
 _WHOLE = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def parse_number(text: str) -> float:
-    """A finite number of its decimal text, blanks around it left out.
+    """Parse a finite decimal number, ignoring surrounding white space.
 
     Raises:
-        ValueError: the text is no number, or one that is beyond the range of a float.
+        ValueError: the text is not a decimal number, or exceeds the range of a float.
     """
     value = float(text) if _NUMBER.fullmatch(text.strip()) else math.nan
     if not math.isfinite(value):
@@ -30,10 +30,10 @@ def parse_number(text: str) -> float:
 
 
 def parse_whole(text: str) -> int:
-    """A whole number of its decimal text, blanks around it left out.
+    """Parse a decimal integer, ignoring surrounding white space.
 
     Raises:
-        ValueError: the text is no whole number, or has over 300 digits.
+        ValueError: the text is not a decimal integer, or has more than ``MOST_DIGITS`` characters.
     """
     if not _WHOLE.fullmatch(text.strip()):
         raise ValueError(f"{shortened(text)} is no whole number")

@@ -1,7 +1,7 @@
-"""Files that users name: their kind and size are checked first, and every failure is one error.
+"""Safe reading of files that users name, with every failure reported as one class of error.
 
-``open_input`` opens a regular file of a limited size, ``decoding`` converts the errors of the
-library that reads its content, and ``ArrayFile`` gives the shapes of arrays before it reads them.
+``open_input`` opens a file after checking its kind and size. ``decoding`` converts exceptions of
+the library that parses the content. ``ArrayFile`` checks the shapes of arrays before it reads them.
 """
 
 from __future__ import annotations
@@ -22,15 +22,22 @@ import numpy.typing as npt
 from sdc_taichi.errors import SdcError
 
 MOST_CONFIG_BYTES = 64_000_000
-"""Largest YAML or JSON file of a configuration, in bytes: twice that of 8,192 racks with 64 groups
-of servers each."""
+"""Largest size of a YAML or JSON file of a configuration, in bytes.
+
+This is twice the size of a configuration of 8,192 racks with 64 groups of servers each.
+"""
 MOST_TABLE_BYTES = 512_000_000
-"""Largest file of weather, carbon intensity or workload, in bytes: an EPW file of four years of
-minutes."""
+"""Largest size of a file of weather, carbon intensity or workload, in bytes.
+
+An EPW file with four years of values per minute has this size.
+"""
 MOST_MATRIX_BYTES = 2_000_000_000
-"""Largest file of a recirculation matrix, in bytes: 8,192 racks, 32 characters per number."""
+"""Largest size of a file of a recirculation matrix, in bytes.
+
+A matrix of 8,192 racks with 32 characters per number has this size.
+"""
 MOST_METRICS_BYTES = 1_000_000_000
-"""Largest metrics.json, in bytes: 10 kB for each of 100,000 data centers."""
+"""Largest size of metrics.json, in bytes: 10 kB for each of 100,000 data centers."""
 _HEADER_BYTES = 1 << 16
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -47,18 +54,21 @@ def open_input(
     most_bytes: float = math.inf,
     error: type[SdcError] = SdcError,
 ) -> Iterator[BufferedReader]:
-    """Open a file for reading, once it is known to be a regular one and not too large.
+    """Open a file for reading after checking that it is a regular file and not too large.
 
-    Nothing is read of pipes and devices, which may have no end, and none is waited for.
+    Pipes and devices are rejected without opening them, because they may block or have no end.
 
     Args:
-        path: the file.
-        most_bytes: largest valid size.
-        error: class of what is raised.
+        path: path of the file.
+        most_bytes: largest valid size, in bytes.
+        error: class of the raised error.
+
+    Yields:
+        The file, open for reading bytes.
 
     Raises:
-        SdcError: of class ``error``: there is no such file, it is of another kind or too large, or
-            it cannot be read, then or while it is open. Its cause is the OSError.
+        SdcError: the file does not exist, is not a regular file, is too large, or cannot be read.
+            The error is of class ``error``. An ``OSError`` in the block is converted too.
     """
     try:
         try:
@@ -82,10 +92,10 @@ def open_input(
 
 
 def list_folder(path: str | os.PathLike[str], error: type[SdcError] = SdcError) -> list[str]:
-    """Names of what lies in a folder, in order; none where there is no such folder.
+    """Return the sorted names of files and folders in a folder; empty if the folder is missing.
 
     Raises:
-        SdcError: of class ``error``: the folder cannot be read.
+        SdcError: the folder cannot be read; the error is of class ``error``.
     """
     try:
         return sorted(os.listdir(path))
@@ -99,18 +109,19 @@ def list_folder(path: str | os.PathLike[str], error: type[SdcError] = SdcError) 
 def decoding(
     path: str | os.PathLike[str], content: str, error: type[SdcError] = SdcError
 ) -> Iterator[None]:
-    """Turn every failure of a library that reads a file into an error that names the file.
+    """Convert every exception of a library that parses a file into an error that names the file.
 
-    What a library raises of a damaged file is not documented, and differs from version to version.
-    Only calls of that library belong into the block.
+    Which exceptions a library raises for a damaged file is undocumented and differs between
+    versions, so all are converted. The block should therefore contain calls of that library only.
 
     Args:
-        path: the file.
-        content: what it should hold, such as ``a matrix``.
-        error: class of what is raised.
+        path: path of the file.
+        content: expected content of the file, such as ``a matrix``, for the message.
+        error: class of the raised error.
 
     Raises:
-        SdcError: of class ``error``; errors of classes of this package pass.
+        SdcError: the block raised an exception. An ``SdcError`` passes unchanged; others are
+            converted to class ``error``.
     """
     try:
         yield
@@ -126,11 +137,11 @@ def decoding(
 def read_bytes(
     path: str | os.PathLike[str], most_bytes: int, error: type[SdcError] = SdcError
 ) -> bytes:
-    """Content of a file.
+    """Return the content of a file.
 
     Raises:
-        SdcError: of class ``error``, as of ``open_input``, or the file holds more than it said, as
-            one that grows does.
+        SdcError: the file cannot be opened or read (see ``open_input``), or it is longer than its
+            size said, because it is growing. The error is of class ``error``.
     """
     with open_input(path, most_bytes, error) as file:
         content = file.read(most_bytes + 1)
@@ -142,11 +153,11 @@ def read_bytes(
 def read_text(
     path: str | os.PathLike[str], most_bytes: int, error: type[SdcError] = SdcError
 ) -> str:
-    """Text of a UTF-8 file, with or without a byte-order mark.
+    """Return the text of a UTF-8 file, with or without a byte-order mark.
 
     Raises:
-        SdcError: of class ``error``, as of ``open_input``, or naming the first byte that is not
-            UTF-8.
+        SdcError: the file cannot be opened or read (see ``open_input``), or is not UTF-8; the
+            message then names the first invalid byte. The error is of class ``error``.
     """
     content = read_bytes(path, most_bytes, error)
     try:
@@ -157,15 +168,15 @@ def read_text(
 
 
 class ArrayFile:
-    """An open .npz file, of which an array is read only once its shape and size are known.
+    """Reader of a .npz file that checks shape and size of an array before it reads the values.
 
     Args:
         file: the file, open for reading.
-        path: its name, for messages.
-        error: class of what is raised.
+        path: path of the file, for messages.
+        error: class of the raised errors.
 
     Raises:
-        SdcError: of class ``error``: the file is no .npz file.
+        SdcError: the file is not a .npz file; the error is of class ``error``.
     """
 
     def __init__(
@@ -179,20 +190,20 @@ class ArrayFile:
         ]
 
     def header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-        """Shape and type of an array, without its values.
+        """Return shape and type of an array without reading its values.
 
         Raises:
-            SdcError: the header is damaged, or the array holds Python objects.
+            SdcError: the header is damaged, or the array contains Python objects.
         """
         with self._member(name) as member:
             return self._read_header(name, member)
 
     def read(self, name: str, most_bytes: float) -> npt.NDArray[Any]:
-        """Values of an array.
+        """Read the values of an array.
 
         Args:
-            name: of the array.
-            most_bytes: largest valid size of the values.
+            name: name of the array.
+            most_bytes: largest valid size of the values, in bytes.
 
         Raises:
             SdcError: the array is damaged or too large.
@@ -207,7 +218,7 @@ class ArrayFile:
             )
         with self._member(name) as member:
             values = np.lib.format.read_array(member, allow_pickle=False)
-            # The checksum is compared at the end of the member.
+            # Reading to the end makes zipfile verify the checksum, and reveals surplus data.
             if member.read(1):
                 raise self._error(f"{self._path}: {name} goes on after its last value")
         return np.asarray(values)

@@ -1,4 +1,4 @@
-"""Functions of the user by name: registered ones, and those with an import path."""
+"""Lookup of user-defined functions, by a registered name or by an import path."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def register_function(
     *,
     reserved: Sequence[str] = (),
 ) -> None:
-    """Make a function available by a name.
+    """Register a function under a name.
 
-    A function replaces an earlier one of the same module and name, as when a cell of a notebook is
-    run again.
+    A function replaces a registered one of the same module and name, so that a notebook cell that
+    registers a function can run again.
 
     Args:
-        kind: what the function is, for errors.
-        name: an identifier that no other function has.
+        kind: kind of function, such as ``reward``, for error messages.
+        name: an identifier that is not the name of another function.
         function: the function.
-        registered: functions by name, to which it is added.
-        reserved: names that no function may have.
+        registered: registered functions by name, to which the function is added.
+        reserved: names that are not allowed.
 
     Raises:
-        ConfigError: a name that another function has, or no function.
+        ConfigError: the name is invalid or in use, or ``function`` is not callable.
     """
     if not callable(function):
         raise ConfigError(
@@ -46,16 +46,16 @@ def register_function(
 
 
 def function_named(option: str, value: Any, registered: dict[str, Any], *, valid: str) -> Any:
-    """A registered function, or one by its import path ``module:name``.
+    """Return the function with a registered name or with an import path ``module:name``.
 
     Args:
-        option: name of the option, for errors.
-        value: value of the option.
-        registered: functions by name.
-        valid: what the option takes besides functions and their import paths, for errors.
+        option: name of the option, for error messages.
+        value: value of the option: a registered name or an import path.
+        registered: registered functions by name.
+        valid: other valid values of the option, for error messages.
 
     Raises:
-        ConfigError: an unknown name, or a path without a function.
+        ConfigError: the name is unknown, or the import path leads to no function.
     """
     module, _, name = value.partition(":") if isinstance(value, str) else ("", "", "")
     if isinstance(value, str) and value in registered:
@@ -77,22 +77,22 @@ def function_named(option: str, value: Any, registered: dict[str, Any], *, valid
 
 
 def import_path(function: Callable[..., Any]) -> str:
-    """Module and name of a function, or of the class of another callable."""
+    """Return the import path ``module:name`` of a function, or of a callable object's class."""
     named = function if hasattr(function, "__qualname__") else type(function)
     return f"{named.__module__}:{named.__qualname__}"
 
 
 def checked_values(what: str, returned: Any, whose: str, size: int) -> F64:
-    """Values that a user's function returned, checked, (B,).
+    """Check the values that a user-defined function returned, and return them with shape (B,).
 
     Args:
-        what: what the function is, for errors.
-        returned: what it returned.
-        whose: for which data centers it returned them, for errors.
-        size: number of data centers, B.
+        what: name of the function, for error messages.
+        returned: value that the function returned: a scalar or an array (B,).
+        whose: data centers or agent of the values, such as ``all data centers``, for messages.
+        size: number B of data centers.
 
     Raises:
-        SdcError: values that are no numbers, not finite, or of another shape.
+        SdcError: the values are not numbers, not finite, or of another shape.
     """
     try:
         values = np.asarray(returned, dtype=np.float64)
@@ -111,8 +111,12 @@ def checked_values(what: str, returned: Any, whose: str, size: int) -> F64:
 
 
 def is_replacement(before: Callable[..., Any] | None, function: Callable[..., Any]) -> bool:
-    """Whether a function may have a name: nothing had it before, or the same function did.
+    """Return True if a function may take a name: the name is free, or has the same function.
 
-    A function counts as the same if its module and name are those of the one before.
+    Functions with the same module and name count as the same function.
+
+    Args:
+        before: function that has the name so far; None if the name is free.
+        function: function that is to take the name.
     """
     return before is None or import_path(function) == import_path(before)

@@ -275,7 +275,7 @@ def _comparison_table(
         cells = [*LABELS[key], metric_text(base, key)]
         for total in list(totals.values())[1:]:
             text = metric_text(total, key)
-                # Temperatures have no relative change, because their zero is arbitrary.
+            # Temperatures have no relative change, because their zero is arbitrary.
             if base.get(key) and total.get(key) is not None and not key.endswith("_c"):
                 text += f" ({100 * (total[key] / base[key] - 1):+z.2f} %)"
             cells.append(text)
