@@ -1,7 +1,7 @@
-"""Weather, grid carbon intensity and workload: embedded synthetic years and files of the user.
+"""Weather, grid carbon intensity and workload: embedded synthetic years, and the user's files.
 
-These modules read and check everything that comes from outside the data center, and resample it to
-the steps of a simulation. They do not model what the data center does with it.
+These modules read and check all data from outside the data center, and resample them to the time
+step of a simulation. They do not model the data center itself.
 """
 
 from sdc_taichi.exogenous.carbon import read_carbon

@@ -1,4 +1,4 @@
-"""Grid carbon intensity: hourly generation by fuel and its average intensity, stamped in UTC."""
+"""Reader of grid carbon intensity: average intensity and hourly generation by fuel, with stamps."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_note
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 
 Pairing = Literal["local", "utc_rows"]
-"""Whether rows are moved to local time, or kept as if UTC were local time."""
+"""Clock of the rows: moved to local standard time, or kept as if UTC were local time."""
 
 MAX_CI_G_PER_KWH = 2000.0
 """Highest valid carbon intensity, in g/kWh."""
 MIX_TOLERANCE_G = 1.0
-"""Largest difference of ``avg_CI`` from what the fuel mix gives, in g/kWh."""
+"""Largest valid difference of ``avg_CI`` from the intensity of the fuel mix, in g/kWh."""
 _MAX_GENERATION_MWH = 1e7
 
 
@@ -37,35 +37,36 @@ def read_carbon(
     longitude_deg: float | None = None,
     columns: Mapping[str, str] = MappingProxyType({}),
 ) -> Series:
-    """Read carbon intensity and bring it to the site's local standard time.
+    """Read carbon intensity, and convert it to the site's local standard time.
 
-    The table has a ``timestamp`` with its UTC offset, generation from WND SUN WAT OIL NG COL NUC
-    OTH (any energy unit; all eight or none) and ``avg_CI`` in g CO2e/kWh. A Parquet file written by
-    ``data import`` is taken as it is, and must be for the same UTC offset.
+    The table has ``timestamp`` with a UTC offset, and ``avg_CI`` in g CO2e/kWh. It may have
+    generation by fuel (WND SUN WAT OIL NG COL NUC OTH, all eight, in any energy unit). A Parquet
+    file written by ``data import`` is used unchanged, and must have the same UTC offset.
 
-    Stamps are moved to local standard time, 29 February is removed, and hours that fall before
-    1 January wrap to the end. EIA-930 stamps mark the end of the hour, yet some authorities report
-    the start, or did until some day. ``stamp="auto"`` reads it from the solar generation: its
-    centre of gravity lies after solar noon when stamps mark the end and before it when they mark
-    the start (one change within the file is detected); without solar generation it is the end.
+    Stamps are moved to local standard time, 29 February is removed, and hours before 1 January move
+    to the end. EIA-930 stamps mark the end of the hour, but some authorities report the start, or
+    did so until a certain day. ``stamp="auto"`` infers the meaning from solar generation, whose
+    centre of gravity is after solar noon if stamps mark the end, and before it if they mark the
+    start. It also detects one change within the file. Without solar generation it assumes the end.
 
     Args:
-        path: CSV or Parquet.
-        utc_offset_h: local standard time minus UTC, hours, -12..14.
-        stamp: what a stamp marks.
-        pairing: ``"utc_rows"`` keeps the order of the rows as the released SustainDC does, which
+        path: CSV or Parquet file.
+        utc_offset_h: local standard time minus UTC, in h, -12..14.
+        stamp: moment of an interval that its stamp marks.
+        pairing: ``"utc_rows"`` keeps the rows in UTC order, like the released SustainDC, which
             pairs UTC hours with local ones.
-        longitude_deg: longitude of the site, for ``"auto"`` and for a warning if solar generation
-            does not fit it; None is the middle of the time zone, without a warning.
-        columns: names of the columns above, with their units where these differ, and the names in
-            the table, such as ``{"timestamp": "Datetime (UTC)", "avg_CI:lb/MWh": "MOER"}``
-            (``exogenous.columns``); stamps of a column whose name says UTC need no offset.
+        longitude_deg: longitude of the site in degrees east, for ``"auto"``, and for a warning if
+            solar generation does not fit it. None stands for the middle of the time zone, without
+            a warning.
+        columns: column names in the table, by the names above, with the unit if it differs, such
+            as ``{"timestamp": "Datetime (UTC)", "avg_CI:lb/MWh": "MOER"}``
+            (``exogenous.columns``). If a column name contains UTC, its stamps need no offset.
 
     Returns:
-        Carbon intensity, g/kWh, resolution of the file, whole years of 365 days.
+        Carbon intensity in g/kWh, at the resolution of the file, for whole years of 365 days.
 
     Raises:
-        DataError: names file, row, column, value and what would be valid.
+        DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     path = Path(path)
     if not (np.isfinite(utc_offset_h) and -12.0 <= utc_offset_h <= 14.0):
@@ -122,22 +123,22 @@ def _read_imported(
 
 
 class _Generation(NamedTuple):
-    """Contiguous rows of a carbon table, repaired."""
+    """Contiguous and repaired rows of a carbon table."""
 
     minutes: float
     """Resolution, in minutes."""
     start_utc: np.datetime64
     """First stamp, in UTC."""
     columns: tuple[str, ...]
-    """Names of the columns: fuels if there are any, then ``avg_CI``."""
+    """Names of the columns: the fuels, if present, then ``avg_CI``."""
     values: FloatArray
-    """Generation and intensity, (T, columns)."""
+    """Generation by fuel in MWh, and intensity in g/kWh, (T, columns)."""
     notes: list[str]
     """Repairs and warnings."""
 
 
 def _read_generation(path: Path, column_names: Mapping[str, str]) -> _Generation:
-    """Read a carbon table, its columns named as of ``read_carbon``."""
+    """Read a carbon table; ``column_names`` has the syntax of ``read_carbon``'s ``columns``."""
     named = column_map(column_names)
     table = files.read_table(path, named.names)
     notes = named.notes()
@@ -163,7 +164,7 @@ def _read_generation(path: Path, column_names: Mapping[str, str]) -> _Generation
 def _numbers(
     table: files.Table, columns: tuple[str, ...], named: ColumnMap
 ) -> tuple[FloatArray, list[str]]:
-    """Generation and intensity, checked against each other, (T, columns), and notes."""
+    """Return generation and intensity, (T, columns), checked against each other, and notes."""
     highest = dict.fromkeys(FUELS, _MAX_GENERATION_MWH) | {"avg_CI": MAX_CI_G_PER_KWH}
     values = np.stack(
         [
@@ -172,7 +173,7 @@ def _numbers(
         ],
         axis=1,
     )
-    # A grid of renewables alone has 0 all year.
+    # A grid with only renewables has an intensity of 0 all year.
     if not np.isnan(values[:, -1]).all() and 0.0 < np.nanmax(values[:, -1]) < 2.0:
         raise DataError(
             f"{table.path}: row {table.frame.index[0]}, column avg_CI: at most "
@@ -198,11 +199,11 @@ def _repair(
     rows: NDArray[np.int64],
     rows_in_file: int,
 ) -> tuple[FloatArray, list[str]]:
-    """Interpolate missing rows and partial hours, (T, columns), and notes."""
+    """Interpolate missing rows and partial hours; return values, (T, columns), and notes."""
     import pandas as pd
 
     notes = []
-    # Long gaps are refused by their column here; below, a row counts as a whole.
+    # First refuse long gaps of single columns; after that, rows are missing or present as a whole.
     files.fill_gaps(path, values, minutes, columns, rows)
     missing = np.isnan(values).any(axis=1)
     blank = int(missing.sum()) - (len(values) - rows_in_file)
@@ -232,7 +233,7 @@ def _repair(
 def _suspicious_rows(
     fuels: FloatArray, total: FloatArray, median: FloatArray
 ) -> list[tuple[NDArray[np.bool_], str]]:
-    """Rows that look wrong but stay, (T,), with the reason; only reasons that occur."""
+    """Find rows that look wrong but stay; return mask, (T,), and reason of each kind found."""
     nuclear, other = fuels[:, FUELS.index("NUC")], fuels[:, FUELS.index("OTH")]
     reporting = np.where(np.isnan(total), np.inf, (fuels > 0.0).sum(axis=1))
     kinds = [

@@ -217,8 +217,8 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
     if not columns:
         return table
     table.require_columns(*columns.values())
-    taken = [name for name, column in columns.items() if name in frame.columns and name != column]
-    if taken or len(set(columns.values())) < len(columns):
+    clashes = [name for name, column in columns.items() if name in frame.columns and name != column]
+    if clashes or len(set(columns.values())) < len(columns):
         raise DataError(
             f"{path}: columns {dict(columns)}: expected each column once, and no name that "
             f"another column of the file has"

@@ -1,7 +1,7 @@
-"""Air: pressure by height above sea level, and wet bulb of whole years at station pressure.
+"""Moist air: pressure by elevation, humidity, and wet bulb of whole years at station pressure.
 
-The equations are those of ASHRAE Handbook - Fundamentals (2017), chapter 1; psychrolib solves the
-same ones for one state at a time, which takes seconds for a year.
+The equations are those of ASHRAE Handbook - Fundamentals (2017), chapter 1. The library psychrolib
+solves the same equations for one state at a time, which takes seconds for a year.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from sdc_taichi.exogenous.series import FloatArray, check_physical
 TRIPLE_POINT_C = 0.01
 MIN_HUMIDITY_RATIO = 1e-7
 ELEVATION_LIMITS_M = (-1000.0, 10_000.0)
-"""Limits of heights above sea level, in m."""
+"""Limits of elevations above sea level, in m."""
 _BISECTIONS = 40  # 180 K / 2**40 < 1e-9 K
 
 
 def standard_pressure_pa(elevation_m: ArrayLike) -> FloatArray:
-    """Pressure of the standard atmosphere, about the mean of the year at that height.
+    """Return the pressure of the standard atmosphere, about the annual mean at an elevation.
 
     Args:
-        elevation_m: height above sea level, -1,000..10,000 m, any shape.
+        elevation_m: elevation above sea level, in m, -1,000..10,000, any shape.
 
     Returns:
-        Same shape, Pa. ASHRAE Fundamentals (2017) ch. 1, eq. 3.
+        Pressure in Pa, same shape (ASHRAE Fundamentals 2017, ch. 1, eq. 3).
 
     Raises:
-        DataError: a height outside its range.
+        DataError: an elevation is outside this range.
     """
     check_physical("elevation_m", elevation_m, *ELEVATION_LIMITS_M)
     ratio = 1.0 - 2.25577e-5 * np.asarray(elevation_m, dtype=np.float64)
@@ -36,13 +36,14 @@ def standard_pressure_pa(elevation_m: ArrayLike) -> FloatArray:
 
 
 def saturation_pressure_pa(temperature_c: ArrayLike) -> FloatArray:
-    """Saturation vapour pressure over ice (below the triple point) or water.
+    """Return the saturation vapour pressure over ice (up to the triple point) or water.
 
     Args:
-        temperature_c: any shape, degrees Celsius.
+        temperature_c: temperature in C, any shape.
 
     Returns:
-        Same shape, Pa. ASHRAE Fundamentals (2017) ch. 1, eq. 5 and 6 (Hyland and Wexler 1983).
+        Pressure in Pa, same shape (ASHRAE Fundamentals 2017, ch. 1, eq. 5 and 6; Hyland and Wexler
+        1983).
     """
     t_c = np.asarray(temperature_c, dtype=np.float64)
     t = t_c + 273.15
@@ -65,7 +66,7 @@ def saturation_pressure_pa(temperature_c: ArrayLike) -> FloatArray:
 def relative_humidity_from_dew_point_pct(
     outdoor_c: ArrayLike, dew_point_c: ArrayLike
 ) -> FloatArray:
-    """Relative humidity, percent, from dry bulb and dew point (eq. 11, 22 and 36)."""
+    """Return relative humidity in % from dry bulb and dew point in C (eq. 11, 22 and 36)."""
     share = saturation_pressure_pa(dew_point_c) / saturation_pressure_pa(outdoor_c)
     return np.asarray(100.0 * share, dtype=np.float64)
 
@@ -73,7 +74,7 @@ def relative_humidity_from_dew_point_pct(
 def humidity_ratio(
     outdoor_c: ArrayLike, relative_humidity_pct: ArrayLike, pressure_pa: ArrayLike
 ) -> FloatArray:
-    """Humidity ratio, kg water per kg dry air (eq. 20 with eq. 22), at least 1e-7."""
+    """Return the humidity ratio, kg water per kg dry air, at least 1e-7 (eq. 20 with eq. 22)."""
     vapour = np.asarray(relative_humidity_pct) / 100.0 * saturation_pressure_pa(outdoor_c)
     ratio = 0.621945 * vapour / (np.asarray(pressure_pa) - vapour)
     return np.asarray(np.maximum(ratio, MIN_HUMIDITY_RATIO), dtype=np.float64)
@@ -82,22 +83,22 @@ def humidity_ratio(
 def wet_bulb_c(
     outdoor_c: ArrayLike, relative_humidity_pct: ArrayLike, pressure_pa: ArrayLike
 ) -> FloatArray:
-    """Thermodynamic wet-bulb temperature at station pressure.
+    """Return the thermodynamic wet-bulb temperature at station pressure.
 
-    Solves ASHRAE Fundamentals (2017) ch. 1, eq. 33 (wet bulb above 0 C) and 35 (below) by
-    bisection to 1e-9 K. The two meet with a step at 0 C, so some states have a root on either
-    side; beginning between dew point and dry bulb finds the one that psychrolib does.
+    The function solves ASHRAE Fundamentals (2017) ch. 1, eq. 33 (wet bulb above 0 C) and 35 (below)
+    by bisection to 1e-9 K. The two equations differ at 0 C, so some states have a solution on
+    each side of it. Bisection between dew point and dry bulb finds the same one as psychrolib.
 
     Args:
-        outdoor_c: dry bulb, -100..70 C; shapes broadcast.
-        relative_humidity_pct: 0..100 percent.
-        pressure_pa: station pressure, 31,000..120,000 Pa.
+        outdoor_c: dry bulb in C, -100..70; the shapes of all arguments broadcast.
+        relative_humidity_pct: relative humidity in %, 0..100.
+        pressure_pa: station pressure in Pa, 31,000..120,000.
 
     Returns:
-        Wet bulb, C, never above the dry bulb.
+        Wet bulb in C, never above the dry bulb.
 
     Raises:
-        DataError: an input outside its range.
+        DataError: an input is outside its range.
     """
     check_physical("outdoor_c", outdoor_c, -100.0, 70.0)
     check_physical("relative_humidity_pct", relative_humidity_pct, 0.0, 100.0)
@@ -128,7 +129,7 @@ def wet_bulb_c(
 
 
 def _dew_point_c(ratio: FloatArray, pressure: FloatArray, outdoor: FloatArray) -> FloatArray:
-    """Dew point, C, at most the dry bulb: eq. 5 and 6 inverted by bisection."""
+    """Return the dew point in C, at most the dry bulb, by bisection of eq. 5 and 6."""
     vapour = pressure * ratio / (0.621945 + ratio)
     low, high = np.full_like(outdoor, -110.0), outdoor
     for _ in range(_BISECTIONS):
@@ -140,17 +141,17 @@ def _dew_point_c(ratio: FloatArray, pressure: FloatArray, outdoor: FloatArray) -
 
 
 def stull_wet_bulb_c(outdoor_c: ArrayLike, relative_humidity_pct: ArrayLike) -> FloatArray:
-    """Wet bulb by Stull's fit at 101.325 kPa, for comparison only.
+    """Return the wet bulb in C by Stull's fit for 101.325 kPa, for comparison only.
 
     Stull (2011), "Wet-bulb temperature from relative humidity and air temperature", Journal of
     Applied Meteorology and Climatology 50(11), eq. 1. Valid for 5..99 percent and -20..50 C.
 
     Args:
-        outdoor_c: dry bulb, C.
-        relative_humidity_pct: percent.
+        outdoor_c: dry bulb, in C.
+        relative_humidity_pct: relative humidity, in %.
 
     Returns:
-        Wet bulb, C.
+        Wet bulb, in C.
     """
     t = np.asarray(outdoor_c, dtype=np.float64)
     rh = np.asarray(relative_humidity_pct, dtype=np.float64)

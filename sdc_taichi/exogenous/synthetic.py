@@ -1,15 +1,15 @@
-"""The embedded year: a seeded generator driven only by fitted figures.
+"""Generator of the embedded synthetic year, from a seed and statistics fitted to real data.
 
-Each quantity is a climatology (annual and diurnal harmonics and their product) plus an
-autocorrelated residual, mapped onto the percentiles of the real series. Weather is dry bulb, dew
-point correlated with it, and pressure; carbon intensity follows from a generated fuel mix in which
-every fuel but the marginal one is drawn and the marginal one takes what wind leaves. The figures
-are in ``sdc_taichi.data/coefficients.json``, found by ``docs/make/fit_year.py``; where they come
-from is in ``data/README.md``.
+Each quantity is a climatology (annual and diurnal harmonics and their products) plus an
+autocorrelated residual, mapped onto the percentiles of the real series. Weather consists of dry
+bulb, dew point (correlated with dry bulb) and pressure. Carbon intensity follows from a generated
+fuel mix. All fuels but the marginal one are drawn, and the marginal one covers the demand that wind
+leaves. ``docs/make/fit_year.py`` fits the statistics in ``sdc_taichi.data/coefficients.json``;
+``data/README.md`` names the sources.
 
-Random numbers are raw PCG64 bits turned to normals by Box-Muller, because NumPy guarantees the bit
-stream but not ``Generator.normal`` across versions. Results are rounded to 1e-4 (workload 1e-6),
-far above the last bits in which processors differ, so that a seed means one year everywhere.
+Random numbers are raw PCG64 bits, converted to normals by Box-Muller: across versions NumPy
+guarantees the bit stream but not ``Generator.normal``. Results are rounded to 1e-4 (workload 1e-6),
+much coarser than rounding differences of processors, so a seed gives the same year everywhere.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ from sdc_taichi.exogenous.series import FloatArray, Series, SiteData
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
 
 TRACE_HOURS = 53 * 168
-"""Hours of a generated workload trace: whole weeks, as in the fitted traces, cut to the year."""
+"""Length of a generated workload trace, in hours: whole weeks, later cut to the year."""
 FUELS = ("WND", "SUN", "WAT", "OIL", "NG", "COL", "NUC", "OTH")
 """Energy sources of EIA-930: wind, sun, water, oil, natural gas, coal, nuclear, other."""
 DEFAULT_SEED = 10
-"""Seed of the embedded year unless a config names another."""
+"""Seed of the embedded year if the configuration has none."""
 
-# Streams of random numbers of one site; slow and fast residuals of fuel i are 100 + i and 200 + i.
+# Random number streams of a site: slow and fast residual of fuel i are streams 100 + i and 200 + i.
 _STREAM_SLOW_FUEL, _STREAM_FAST_FUEL, _STREAM_TRACE = 100, 200, 300
 _WARM_UP_H = 240
 
 Figures = dict[str, Any]
-"""Fitted figures of a site, a grid, a quantity or a trace, by their names in coefficients.json."""
+"""Fitted statistics of a site, grid, quantity or trace, by their names in coefficients.json."""
 
 
 @lru_cache(maxsize=1)
 def coefficients() -> Figures:
-    """All embedded figures, shared by every caller: not to be changed."""
+    """Return all embedded statistics; callers share the object and must not change it."""
     text = files("sdc_taichi.data").joinpath("coefficients.json").read_text(encoding="utf-8")
     figures: Figures = json.loads(text)
     return figures
 
 
 def emission_factors() -> dict[str, float]:
-    """Life-cycle emissions per fuel, g CO2e/kWh, that turn a fuel mix into ``avg_CI``."""
+    """Return life-cycle emission factors by fuel, in g CO2e/kWh, from which ``avg_CI`` follows."""
     factors: dict[str, float] = coefficients()["emission_factors_g_per_kwh"]
     return dict(factors)
 
 
 def synthetic_sites() -> tuple[str, ...]:
-    """Names of the embedded sites."""
+    """Return the names of the embedded sites."""
     return tuple(coefficients()["weather"])
 
 
 def synthetic_traces() -> tuple[str, ...]:
-    """Names of the embedded workload traces."""
+    """Return the names of the embedded workload traces."""
     return tuple(coefficients()["workload"])
 
 
@@ -77,13 +77,13 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
 
     Args:
         name: one of ``synthetic_sites()``.
-        seed: non-negative; sites draw independently of each other under the same seed.
+        seed: non-negative seed; sites are independent of each other under the same seed.
 
     Returns:
-        The site, 8760 values per series, ``synthetic`` set.
+        The site, with 8760 values per series and ``synthetic`` set.
 
     Raises:
-        DataError: unknown name or invalid seed.
+        DataError: the name is unknown or the seed is not valid.
     """
     if name not in synthetic_sites():
         raise DataError(f"site {shortened(name)}: expected one of {', '.join(synthetic_sites())}")
@@ -122,17 +122,17 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
 
 @lru_cache(maxsize=64, typed=True)
 def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
-    """Generate one hourly year of workload, share of the capacity.
+    """Generate one hourly year of workload, as a share of the capacity.
 
     Args:
         name: one of ``synthetic_traces()``.
-        seed: non-negative; traces draw independently of each other under the same seed.
+        seed: non-negative seed; traces are independent of each other under the same seed.
 
     Returns:
-        8760 values in [0, 1], ``synthetic`` set.
+        8760 values in [0, 1], with ``synthetic`` set.
 
     Raises:
-        DataError: unknown name or invalid seed.
+        DataError: the name is unknown or the seed is not valid.
     """
     if name not in synthetic_traces():
         raise DataError(f"trace {shortened(name)}: expected one of {', '.join(synthetic_traces())}")
@@ -156,30 +156,31 @@ class Basis(NamedTuple):
     columns: FloatArray
     """One function per column, (hours, functions)."""
     products: FloatArray
-    """Scalar products of the columns, (functions, functions), stored because they are costly."""
+    """Scalar products of the columns, (functions, functions), precomputed because they are slow."""
 
     def project(self, z: FloatArray) -> FloatArray:
-        """Least-squares coefficients, (functions,), of values z, (hours,)."""
+        """Return least-squares coefficients, (functions,), of values z, (hours,)."""
         return np.asarray(np.linalg.solve(self.products, self.columns.T @ z), dtype=np.float64)
 
 
 def make_basis(columns: list[FloatArray]) -> Basis:
-    """Basis of the given functions, each (hours,)."""
+    """Return the basis of given functions, each (hours,)."""
     stacked = np.stack(columns, axis=1)
     return Basis(stacked, stacked.T @ stacked)
 
 
 @lru_cache(maxsize=32)
 def climatology_basis(annual: int, diurnal: int, products: tuple[int, ...]) -> Basis:
-    """Constant, annual harmonics, diurnal harmonics, and products of both.
+    """Return a basis of constant, annual harmonics, diurnal harmonics, and products of both.
 
     Args:
         annual: order of the annual harmonics.
         diurnal: order of the diurnal harmonics.
-        products: diurnal harmonics that are multiplied by the first annual one, so that the shape
-            of the day changes with the season.
+        products: diurnal harmonics to multiply by the first annual one, so that the shape of the
+            day changes with the season.
 
     Returns:
+        Basis over the hours of the year.
         Basis of the hours of the year.
     """
     year = 2.0 * np.pi * (np.arange(HOURS_PER_YEAR) + 0.5) / HOURS_PER_YEAR
@@ -199,10 +200,10 @@ def climatology_basis(annual: int, diurnal: int, products: tuple[int, ...]) -> B
 
 
 def trace_basis(hours: int, annual: int, diurnal: int, weekly: int) -> Basis:
-    """Constant and harmonics of the year, the day and the week, for the first hours of a year.
+    """Return a basis of constant and harmonics of year, day and week, from the start of a year.
 
     Args:
-        hours: length.
+        hours: length of the basis, in hours.
         annual: order of the annual harmonics.
         diurnal: order of the diurnal harmonics.
         weekly: order of the weekly harmonics.
@@ -220,17 +221,18 @@ def trace_basis(hours: int, annual: int, diurnal: int, weekly: int) -> Basis:
 
 
 def solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) -> FloatArray:
-    """Clear-sky output of a fleet of solar plants as a share of its greatest.
+    """Return the clear-sky output of a group of solar plants, as a share of its maximum.
 
-    Sine of the solar elevation (declination by Cooper 1969), saturating as trackers do.
+    It follows the sine of the solar elevation (declination by Cooper 1969), with saturation as for
+    plants with trackers.
 
     Args:
-        latitude_deg: centre of the fleet, degrees north.
-        lateness_h: solar noon of the fleet after 12:00 local standard time, hours.
-        saturation: 0 for output in proportion to the sine; the larger, the flatter around noon.
+        latitude_deg: latitude of the plants' centre, in degrees north.
+        lateness_h: delay of the plants' solar noon after 12:00 local standard time, in h.
+        saturation: 0 for output proportional to the sine; larger values flatten the midday.
 
     Returns:
-        Share in 0..1 of each hour of the year, (8760,).
+        Share of each hour of the year, 0..1, (8760,).
     """
     hour = np.arange(HOURS_PER_YEAR)
     declination = np.radians(23.45) * np.sin(2.0 * np.pi * (284 + hour // 24 + 1) / DAYS_PER_YEAR)
@@ -250,7 +252,7 @@ def solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) ->
 
 
 def seeded_normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
-    """Standard normals, (n,), of a stream of a site, from raw bits (Box and Muller 1958)."""
+    """Return standard normals, (n,), of a site's stream, from raw bits (Box and Muller 1958)."""
     key = zlib.crc32(name.encode())
     bits = np.random.PCG64(np.random.SeedSequence([int(seed), stream, key]))
     half = (n + 1) // 2
@@ -263,10 +265,10 @@ def seeded_normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
 
 
 def _filtered(kicks: FloatArray, phi: float) -> FloatArray:
-    """``x[t] = phi * x[t - 1] + kicks[t]`` along the first axis.
+    """Return x with ``x[t] = phi * x[t - 1] + kicks[t]`` along the first axis.
 
-    By doubling: the sum of 2 n kicks is the sum of the last n, plus ``phi**n`` times the sum of the
-    n before them.
+    The filter works by doubling: the weighted sum of the last 2 n kicks is that of the last n, plus
+    ``phi**n`` times that of the n before them.
     """
     x, n, weight = kicks.copy(), 1, phi
     while n < len(x) and weight > 1e-20:
@@ -276,16 +278,17 @@ def _filtered(kicks: FloatArray, phi: float) -> FloatArray:
 
 
 def _ar1(noise: FloatArray, phi: float) -> FloatArray:
-    """First-order autoregression of unit variance along the first axis, in its stationary state."""
+    """Return a stationary first-order autoregression of unit variance along the first axis."""
     kicks = noise * math.sqrt(1.0 - phi * phi)
     kicks[0] = noise[0]
     return _filtered(kicks, phi)
 
 
 def _ar2(noise: FloatArray, memory_h: float, smooth_h: float) -> FloatArray:
-    """Two first-order filters in a row: memory of ``memory_h``, smooth below ``smooth_h``.
+    """Return a second-order autoregression with memory ``memory_h``, smooth below ``smooth_h``.
 
-    Unit variance (Box, Jenkins and Reinsel 2008, eq. 3.2.28); the last kicks warm it up.
+    It is two first-order filters in series, scaled to unit variance (Box, Jenkins and Reinsel 2008,
+    eq. 3.2.28). The last kicks serve as warm-up.
     """
     f, g = math.exp(-1.0 / memory_h), math.exp(-1.0 / max(smooth_h, 1e-3))
     a, b = f + g, -f * g
@@ -295,9 +298,10 @@ def _ar2(noise: FloatArray, memory_h: float, smooth_h: float) -> FloatArray:
 
 
 def _residual(p: Figures, slow: FloatArray, fast: FloatArray, basis: Basis) -> FloatArray:
-    """Residual: a slow part plus a fast part with a memory from day to day.
+    """Return a residual: a slow part plus a fast part, the latter also correlated from day to day.
 
-    Orthogonal to the climatology and of the fitted standard deviation, so that it changes neither.
+    The residual is orthogonal to the climatology and has the fitted standard deviation, so it
+    changes neither of them.
     """
     if "tm" in p:
         z = math.sqrt(p["w"]) * _ar2(slow, p["ts"], p["tm"])
@@ -317,25 +321,25 @@ def _residual(p: Figures, slow: FloatArray, fast: FloatArray, basis: Basis) -> F
 
 
 def _match_percentiles(values: FloatArray, percentiles: list[float]) -> FloatArray:
-    """Values mapped onto the fitted percentiles, linearly between their present percentiles."""
+    """Map values onto the fitted percentiles, linearly between their own percentiles."""
     present = np.asarray(np.percentile(values, coefficients()["pins_percent"]), dtype=np.float64)
-    knots = np.maximum.accumulate(present + 1e-9 * np.arange(present.size))  # ties stay increasing
+    knots = np.maximum.accumulate(present + 1e-9 * np.arange(present.size))  # keep ties increasing
     return np.interp(values, knots, percentiles)
 
 
 def _quantity(p: Figures, slow: FloatArray, fast: FloatArray) -> FloatArray:
-    """One quantity over the year: its climatology plus a residual, on the fitted percentiles.
+    """Generate one quantity for a year: climatology plus residual, with the fitted percentiles.
 
-    Climatology and percentiles are imposed in turn: both are targets of a typical year, and each
-    disturbs the other a little.
+    Climatology and percentiles are both targets of a typical year, and each disturbs the other a
+    little. They are therefore imposed alternately.
 
     Args:
-        p: figures of the quantity.
+        p: fitted statistics of the quantity.
         slow: standard normals of the slow part of the residual, (8760,).
         fast: standard normals of its fast part, (8760,).
 
     Returns:
-        (8760,), in the unit of the percentiles.
+        Values, (8760,), in the unit of the percentiles.
     """
     annual, diurnal, products = p["h"]
     basis = climatology_basis(annual, diurnal, tuple(products))
@@ -360,7 +364,7 @@ def _quantity(p: Figures, slow: FloatArray, fast: FloatArray) -> FloatArray:
 def _weather(
     figures: Figures, normals: Callable[[int], FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Dry bulb (C), relative humidity (%) and station pressure (Pa), each (8760,)."""
+    """Generate dry bulb (C), relative humidity (%) and station pressure (Pa), each (8760,)."""
     noise = [normals(i) for i in range(5)]
     outdoor = _quantity(figures["T"], noise[0], noise[1])
     rho_slow, rho_fast = figures["D"]["rho"]
@@ -379,16 +383,16 @@ def _weather(
 
 
 def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) -> FloatArray:
-    """Rows of noise mixed from independent ones, with given correlations between pairs.
+    """Mix independent rows of noise so that pairs of rows have given correlations.
 
     Args:
-        names: of the rows.
-        pairs: correlations by ``A-B``; those left out are 0. A matrix that is not positive definite
-            is changed to one that is.
+        names: names of the rows.
+        pairs: correlations by ``A-B``, 0 for missing pairs. A matrix that is not positive definite
+            is replaced by a similar one that is.
         noise: independent standard normals, (rows, hours).
 
     Returns:
-        (rows, hours).
+        Correlated rows, (rows, hours).
     """
     matrix = np.eye(len(names))
     for pair, value in pairs.items():
@@ -401,10 +405,10 @@ def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) ->
 
 
 def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[str, FloatArray]:
-    """Generation of each fuel, MWh in the hour, (8760,).
+    """Generate the generation of each fuel, in MWh per hour, (8760,).
 
-    NET, the marginal fuel plus wind, is drawn like a fuel; the marginal fuel is what wind leaves of
-    it. So a windy hour takes from gas (from hydro in WA) as much as wind gives.
+    NET is the sum of the marginal fuel and wind. It is drawn like a fuel, and the marginal fuel is
+    NET minus wind. In a windy hour, wind therefore replaces an equal amount of gas (hydro in WA).
     """
     names: list[str] = figures["order"]
     slow, fast = (
@@ -418,7 +422,7 @@ def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[st
     mix = {fuel: np.full(HOURS_PER_YEAR, float(figures["flat"].get(fuel, 0.0))) for fuel in FUELS}
     for i, name in enumerate(names):
         p = figures["drv"][name]
-        if name == "SUN":  # percentiles are those of daylight hours, after the envelope
+        if name == "SUN":  # percentiles are of daylight hours, after the envelope
             envelope = solar_envelope(*figures["sun"])
             clear = _quantity({k: x for k, x in p.items() if k != "q"}, slow[i], fast[i])
             output = np.maximum(clear, 0.0) * envelope
@@ -432,7 +436,7 @@ def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[st
 
 
 def _workload(figures: Figures, normals: Callable[[int], FloatArray]) -> FloatArray:
-    """Utilisation, 0..1, (TRACE_HOURS,): annual, daily and weekly harmonics plus a residual."""
+    """Generate utilisation, 0..1, (TRACE_HOURS,): annual, daily, weekly harmonics plus residual."""
     basis = trace_basis(TRACE_HOURS, figures["annual"], figures["D"], figures["W"])
     slow, fast = normals(_STREAM_TRACE), normals(_STREAM_TRACE + 1)
     values = basis.columns @ np.array(figures["c"]) + _residual(figures, slow, fast, basis)

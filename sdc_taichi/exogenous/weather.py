@@ -1,4 +1,4 @@
-"""Weather files: EnergyPlus EPW, and what `data import` writes."""
+"""Reader of weather files: EnergyPlus EPW, and Parquet files that `data import` wrote."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.user_file import MOST_TABLE_BYTES, open_input, read_bytes
 
 HEADER_LINES = 8
-"""Lines before the first row of data."""
+"""Number of header lines before the first row of data."""
 DATA_COLUMNS = 35
-"""Columns of a row of data."""
+"""Number of columns in a row of data."""
 PRESSURE_LIMITS_PA = (31_000.0, 120_000.0)
 """Limits of station pressure in EPW files, in Pa."""
 
@@ -45,35 +45,35 @@ class _Column(NamedTuple):
     name: str
     """Name for messages."""
     limits: tuple[float, float]
-    """Least and greatest valid value."""
+    """Smallest and largest valid value."""
     missing: float
     """Number that stands for a missing value."""
     hint: str = ""
-    """What a value beyond the limits may be, for messages."""
+    """Probable cause of a value outside the limits, for messages."""
 
 
 _FAHRENHEIT = " C (degrees Fahrenheit taken for C?)"
 _MONTH, _DAY, _HOUR = "month (column 2)", "day (column 3)", "hour (column 4)"
 _DRY_BULB = _Column("dry bulb (column 7)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
 HUMIDITY_LIMITS_PCT = (0.0, 110.0)
-"""Limits of relative humidity, of which 100 % is what air can hold."""
+"""Limits of relative humidity, in %; values above 100 % count as 100 %."""
 _DEW_POINT = _Column("dew point (column 8)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
 _HUMIDITY = _Column("relative humidity (column 9)", HUMIDITY_LIMITS_PCT, 999.0)
 _PRESSURE = _Column("station pressure (column 10)", PRESSURE_LIMITS_PA, 999_999.0)
 _MEASURED = (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE)
 _COLUMN_NAMES = ["year", _MONTH, _DAY, _HOUR, "minute", "source", *(c.name for c in _MEASURED)]
-"""Names of the first columns of a row, the only ones that are read."""
+"""Names of the first columns of a row; no other columns are read."""
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
-"""Columns that give the weather; the dew point is only checked."""
+"""Columns from which the weather is built; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
-"""By this much a dew point may exceed the dry bulb, as both are rounded."""
+"""Largest valid excess of a dew point above the dry bulb, in K; both are rounded in files."""
 MOST_PRESSURE_SHARE = 0.05
-"""Largest difference of a month's mean pressure from the standard atmosphere, as a share of it;
-weather and climate make up to 0.03 at the heights where people live."""
+"""Largest valid difference of a month's mean pressure from the standard atmosphere, as a share of
+the latter. Weather and climate cause up to 0.03 at inhabited elevations."""
 _COOLING_CELLS = {"outdoor_c": 3, "wet_bulb_c": 9}
-"""Cells of the design conditions, counted from the word ``Cooling``."""
+"""Cells of the design conditions, counted from the cell ``Cooling``."""
 _EXTREME_OUTDOOR_CELL = -3
-"""Cell of the highest dry bulb in 20 years: before lowest and highest of 50 years, the last."""
+"""Cell of the highest dry bulb in 20 years; the lowest and highest in 50 years follow it."""
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 _LONGEST_LINE = 4096
 _DAYS_PER_MONTH = np.array(DAYS_PER_MONTH)
@@ -81,21 +81,21 @@ _FIRST_DAY_OF_MONTH = np.array(FIRST_DAY_OF_MONTH)
 
 
 def read_epw(path: str | Path) -> Weather:
-    """Read an EPW file: dry bulb, relative humidity, station pressure; wet bulb is computed.
+    """Read an EPW file: dry bulb, relative humidity and station pressure; compute wet bulb.
 
-    Hour k of the format is the hour that ends at k, in local standard time. Years may differ
-    between months, as in typical years; several years may follow each other, and an hour may have
-    several rows (DATA PERIODS). 29 February is removed, missing codes and absent hours up to 24 h
-    are interpolated. A Parquet file written by ``data import`` is read too.
+    Hour k in the format is the hour that ends at k, in local standard time. Months may be from
+    different years, as in typical years. The file may have several years, and several rows per
+    hour (DATA PERIODS). 29 February is removed. Missing codes and absent hours are interpolated, up
+    to 24 h. The function also reads Parquet files written by ``data import``.
 
     Args:
-        path: EPW or Parquet.
+        path: EPW or Parquet file.
 
     Returns:
-        Weather, whole years of 365 days.
+        Weather for whole years of 365 days.
 
     Raises:
-        DataError: names file, row, column, value and what would be valid.
+        DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     path = Path(path)
     if files.is_parquet(path):
@@ -125,7 +125,7 @@ def read_epw(path: str | Path) -> Weather:
 
 
 class Air(NamedTuple):
-    """Outdoor air of whole years."""
+    """Outdoor air, for whole years."""
 
     outdoor_c: FloatArray
     """Dry bulb, in C, (T,)."""
@@ -143,15 +143,15 @@ def make_weather(
     notes: Sequence[str],
     design: DesignConditions | None = None,
 ) -> Weather:
-    """Weather of measured air, with its wet bulb.
+    """Build the weather of measured air, and compute its wet bulb.
 
     Args:
-        path: file that was read.
-        location: fields of ``Weather`` that say where the station is.
-        minutes: resolution.
-        air: the air.
+        path: file from which the data were read.
+        location: location of the station, as fields of ``Weather``.
+        minutes: resolution, in minutes.
+        air: measured air.
         notes: repairs and warnings.
-        design: design conditions of the file; None if it has none.
+        design: design conditions in the file; None if it has none.
     """
 
     def series(name: str, unit: str, x: FloatArray) -> Series:
@@ -168,13 +168,13 @@ def make_weather(
 
 
 def read_city(path: str | Path) -> str:
-    """City of the station of a weather file, by its header; empty if it names none.
+    """Return the city of the station in the header of a weather file; empty if there is none.
 
     Args:
-        path: EPW, or Parquet written by ``data import``.
+        path: EPW file, or Parquet file written by ``data import``.
 
     Raises:
-        DataError: the file cannot be read, or is neither.
+        DataError: the file cannot be read, or has another format.
     """
     path = Path(path)
     if files.is_parquet(path):
@@ -187,13 +187,13 @@ def read_city(path: str | Path) -> str:
 
 
 def read_elevation_m(path: str | Path) -> float:
-    """Height of the station of a weather file above sea level, in m, by its header.
+    """Return the elevation of the station in the header of a weather file, in m above sea level.
 
     Args:
-        path: EPW, or Parquet written by ``data import``.
+        path: EPW file, or Parquet file written by ``data import``.
 
     Raises:
-        DataError: the file cannot be read, is neither, or names no height.
+        DataError: the file cannot be read, has another format, or has no elevation.
     """
     path = Path(path)
     if files.is_parquet(path):
@@ -208,7 +208,7 @@ def _first_line(path: Path) -> str:
 
 
 def _decoded(content: bytes) -> str:
-    """Text of an EPW file; names of places are UTF-8 or Latin-1."""
+    """Decode the text of an EPW file; place names may be in UTF-8 or Latin-1."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -216,7 +216,7 @@ def _decoded(content: bytes) -> str:
 
 
 def _location(path: Path, lines: list[str]) -> dict[str, Any]:
-    """Place of the station by the first line, as fields of ``Weather``."""
+    """Parse the location of the station in the first line, as fields of ``Weather``."""
     fields = [x.strip() for x in lines[0].split(",")] if lines else [""]
     if fields[0].upper() != "LOCATION":
         raise DataError(
@@ -243,7 +243,7 @@ def _location(path: Path, lines: list[str]) -> dict[str, Any]:
 
 
 def _design_conditions(lines: list[str]) -> tuple[DesignConditions | None, list[str]]:
-    """Design conditions of the header, and notes; None where it has none."""
+    """Parse the design conditions in the header; return None if there are none, and notes."""
     for line in lines[1:HEADER_LINES]:
         cells = [x.strip() for x in line.split(",")]
         if cells[0].upper() != "DESIGN CONDITIONS" or "Cooling" not in cells:
@@ -263,7 +263,7 @@ def _design_conditions(lines: list[str]) -> tuple[DesignConditions | None, list[
 
 
 def _pressure_notes(pressure: FloatArray, minutes: float, elevation_m: float) -> list[str]:
-    """Warning of months whose mean pressure does not fit the elevation of the station."""
+    """Return a warning about months whose mean pressure does not fit the station's elevation."""
     standard_pa = float(standard_pressure_pa(elevation_m))
     days = pressure.reshape(-1, DAYS_PER_YEAR, round(MINUTES_PER_DAY / minutes))
     means_pa = np.array([days[:, a:b].mean() for a, b in pairwise(FIRST_DAY_OF_MONTH)])
@@ -278,7 +278,7 @@ def _pressure_notes(pressure: FloatArray, minutes: float, elevation_m: float) ->
 
 
 def _records_per_hour(path: Path, lines: list[str]) -> int:
-    """Records per hour of the DATA PERIODS line, the last of the header."""
+    """Return the number of records per hour, from the DATA PERIODS line (last of the header)."""
     if len(lines) < HEADER_LINES:
         raise DataError(f"{path}: row {len(lines)}: ends in the header, expected 8 header lines")
     fields = [x.strip() for x in lines[HEADER_LINES - 1].split(",")]
@@ -295,7 +295,7 @@ def _records_per_hour(path: Path, lines: list[str]) -> int:
 
 
 def _rows(path: Path, lines: list[str]) -> files.Table:
-    """First columns of the rows of data, by the names of ``_COLUMN_NAMES``."""
+    """Return the first columns of the data rows, named as in ``_COLUMN_NAMES``."""
     import pandas as pd
 
     data = lines[HEADER_LINES:]
@@ -317,7 +317,7 @@ def _rows(path: Path, lines: list[str]) -> files.Table:
 
 
 def _hours(table: files.Table) -> tuple[NDArray[np.int64], files.Table, list[str]]:
-    """Hour of the 365-day year of each row, (T,), rows without 29 February, and notes."""
+    """Return each row's hour of the 365-day year, (T,), rows without 29 February, and notes."""
     dates = []
     for column, high in ((_MONTH, 12), (_DAY, 31), (_HOUR, 24)):
         values = table.numbers(column, 1.0, high)
@@ -338,7 +338,7 @@ def _hours(table: files.Table) -> tuple[NDArray[np.int64], files.Table, list[str
 
 
 def _positions(table: files.Table, hours: NDArray[np.int64], per_hour: int) -> NDArray[np.int64]:
-    """Place of each row on a regular grid that begins with the first row, (T,)."""
+    """Return the position of each row on a regular grid that begins at the first row, (T,)."""
     rows = table.frame.index.to_numpy()
     starts = np.flatnonzero(np.diff(hours, prepend=hours[0] - 1))
     counts = np.diff(starts, append=hours.size)
@@ -373,12 +373,12 @@ def _positions(table: files.Table, hours: NDArray[np.int64], per_hour: int) -> N
 
 
 def _columns(table: files.Table) -> tuple[FloatArray, list[str]]:
-    """Dry bulb, relative humidity and pressure, (T, 3), NaN where missing, and notes."""
+    """Return dry bulb, relative humidity and pressure, (T, 3), NaN for missing, and notes."""
     import pandas as pd
 
     values, notes = {}, []
     for column in _MEASURED:
-        # Missing codes are written with any number of decimals.
+        # Files write missing codes with any number of decimals.
         text = table.frame[column.name]
         is_code = pd.to_numeric(text, errors="coerce") == column.missing
         known = files.Table(table.path, text.mask(is_code, "nan").to_frame())
@@ -398,10 +398,10 @@ def _columns(table: files.Table) -> tuple[FloatArray, list[str]]:
 def check_dew_point(
     table: files.Table, column: str, dew_point_c: FloatArray, outdoor_c: FloatArray
 ) -> None:
-    """Reject a dew point above the dry bulb, in C, (T,) both.
+    """Check that no dew point is above the dry bulb, both in C, (T,).
 
     Raises:
-        DataError: names file, row, column and value.
+        DataError: a dew point is too high; the message names file, row, column and value.
     """
     above = dew_point_c > outdoor_c + _DEW_POINT_SLACK_K
     dry_bulb = f"{outdoor_c[np.argmax(above)]:g} C"
@@ -409,7 +409,7 @@ def check_dew_point(
 
 
 def capped_humidity(percent: FloatArray) -> tuple[FloatArray, list[str]]:
-    """Relative humidity of at most 100 %, (T,), and notes."""
+    """Limit relative humidity, in %, (T,), to 100 %; return it with notes."""
     over = percent > 100.0
     if not over.any():
         return percent, []
@@ -423,7 +423,7 @@ _QUANTITIES = {
     "relative_humidity_pct": series_file.Quantity("%", 0.0, 100.0),
     "pressure_pa": series_file.Quantity("Pa", *PRESSURE_LIMITS_PA),
 }
-"""Quantities of a file of weather that ``data import`` wrote."""
+"""Quantities in a weather file that ``data import`` wrote."""
 _PLACE_FIELDS = ("latitude_deg", "longitude_deg", "elevation_m", "utc_offset_h")
 
 
@@ -445,7 +445,7 @@ def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
 
 
 def _imported_design(path: Path, metadata: dict[str, Any]) -> DesignConditions | None:
-    """Design conditions that ``data import`` stored; None if its file had none."""
+    """Return the design conditions that ``data import`` stored; None if there are none."""
     if metadata.get("design") is None:
         return None
     stored = series_file.metadata_value(path, metadata, "design", dict)

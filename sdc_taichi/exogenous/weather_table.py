@@ -1,4 +1,4 @@
-"""Weather in tables, such as the record of a station on the roof."""
+"""Reader of weather tables, such as the records of a weather station on a roof."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FAHRENHEIT = " C (degrees Fahrenheit are read with --map dry_bulb:F=COLUMN)"
 
 
 class Place(NamedTuple):
-    """Where a station is."""
+    """Location of a weather station."""
 
     label: str
     """Name of the place."""
@@ -58,26 +58,25 @@ def read_weather_table(
     columns: Mapping[str, str],
     stamp: Literal["start", "end"] = "start",
 ) -> Weather:
-    """Read weather from a table with ``timestamp`` and ``dry_bulb``.
+    """Read weather from a table with time stamps and dry bulb.
 
-    It also has ``relative_humidity``, or ``dew_point`` from which humidity follows (ASHRAE
-    Fundamentals 2017, ch. 1), and may have ``pressure``. Without pressure, that of the standard
-    atmosphere is used. Stamps are in local standard time, or each has a UTC offset; 29 February is
-    removed, and gaps of up to 24 h are interpolated.
+    The table has ``timestamp`` and ``dry_bulb``, and either ``relative_humidity`` or ``dew_point``,
+    from which humidity is computed (ASHRAE Fundamentals 2017, ch. 1). It may have ``pressure``;
+    otherwise the pressure of the standard atmosphere is used. Stamps are in local standard time,
+    or all have a UTC offset. 29 February is removed, and gaps of up to 24 h are interpolated.
 
     Args:
-        path: CSV or Parquet.
-        place: where the station is.
-        columns: the names above, with units other than C, % and Pa, and the names in the table,
-            such as ``{"dry_bulb:F": "Temp", "dew_point:F": "Dew"}``
-            (``exogenous.columns``).
-        stamp: whether a stamp marks the start or the end of its interval.
+        path: CSV or Parquet file.
+        place: location of the station.
+        columns: column names in the table, by the names above, with the unit if it is not C, % or
+            Pa, such as ``{"dry_bulb:F": "Temp", "dew_point:F": "Dew"}`` (``exogenous.columns``).
+        stamp: moment of an interval that its stamp marks, ``start`` or ``end``.
 
     Returns:
-        Weather, resolution of the file, whole years of 365 days.
+        Weather at the resolution of the file, for whole years of 365 days.
 
     Raises:
-        DataError: names file, row, column, value and what would be valid.
+        DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     path = Path(path)
     _check(place)
@@ -97,7 +96,7 @@ def read_weather_table(
     notes += absent_notes + year_notes
     outdoor, humidity = values[:, 0], values[:, 1]
     if humid == "dew_point":
-        # Both are rounded, so the dew point may be slightly above the dry bulb.
+        # Both values are rounded, so the dew point may be slightly above the dry bulb.
         humidity = relative_humidity_from_dew_point_pct(outdoor, np.minimum(humidity, outdoor))
     if "pressure" in names:
         pressure = values[:, 2]
@@ -120,7 +119,7 @@ def _check(place: Place) -> None:
 
 
 def _local_stamps(table: files.Table, utc_offset_h: float) -> NDArray[np.datetime64]:
-    """Stamps in local standard time, (T,)."""
+    """Return the stamps in local standard time, (T,)."""
     stamps, has_offset = table.stamps("timestamp")
     valid = "a time such as 2022-01-01 00:00:00, " + (
         "with its UTC offset as in the first row"
@@ -134,7 +133,7 @@ def _local_stamps(table: files.Table, utc_offset_h: float) -> NDArray[np.datetim
 def _numbers(
     table: files.Table, names: list[str], named: ColumnMap
 ) -> tuple[FloatArray, list[str]]:
-    """Columns as numbers in C, % and Pa, (T, columns), and notes."""
+    """Return the columns as numbers in C, % and Pa, (T, columns), and notes."""
     notes = named.notes()
     values = {}
     for name in names:

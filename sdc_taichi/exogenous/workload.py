@@ -1,4 +1,4 @@
-"""Workload traces: the share of the capacity that is asked for, interval by interval."""
+"""Reader of workload traces: requested share of the capacity in each interval."""
 
 from __future__ import annotations
 
@@ -28,23 +28,21 @@ def read_workload(
 ) -> Series:
     """Read a workload trace.
 
-    The table has ``cpu_load`` in [0, 1] and, optionally, a first column with a running index or
-    local standard time stamps without UTC offset. Rows without stamps begin on 1 January at 00:00
-    and are hourly unless ``minutes`` says otherwise. A Parquet file written by ``data import`` is
-    taken as it is.
+    The table has ``cpu_load`` in [0, 1]. An optional first column has a running index, or stamps in
+    local standard time without UTC offset. Rows without stamps begin on 1 January at 00:00 and are
+    hourly unless ``minutes`` is given. A Parquet file written by ``data import`` is used unchanged.
 
     Args:
-        path: CSV or Parquet.
-        minutes: resolution of a file without stamps; None means hourly.
-        columns: ``cpu_load``, with its unit where it is another, or ``timestamp``, and the names
-            that they have in the table, such as ``{"cpu_load:kW,120..800": "PDU"}``
-            (``exogenous.columns``).
+        path: CSV or Parquet file.
+        minutes: resolution of a file without stamps, in minutes; None means hourly.
+        columns: column names in the table, by ``cpu_load`` (with the unit if it differs) and
+            ``timestamp``, such as ``{"cpu_load:kW,120..800": "PDU"}`` (``exogenous.columns``).
 
     Returns:
-        Utilisation, whole years of 365 days.
+        Utilisation, for whole years of 365 days.
 
     Raises:
-        DataError: names file, row, column, value and what would be valid.
+        DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     path = Path(path)
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
@@ -80,18 +78,18 @@ def read_workload(
 def _clock(
     table: files.Table, minutes: float | None
 ) -> tuple[float, NDArray[np.int64], np.datetime64 | None, list[str]]:
-    """Where the rows lie in time, by the first column if it holds stamps or a running index.
+    """Determine the times of the rows from stamps or a running index in the first column.
 
     Args:
         table: the table.
-        minutes: resolution that was asked for, in minutes, or None.
+        minutes: requested resolution in minutes, or None.
 
     Returns:
-        Resolution in minutes, place of each row on a regular grid, (T,), first stamp (None without
-        stamps), and notes.
+        Resolution in minutes, position of each row on a regular grid, (T,), first stamp (None
+        without stamps), and notes.
 
     Raises:
-        DataError: stamps of another resolution, or a gap of over 24 h.
+        DataError: stamps have another resolution, or there is a gap of more than 24 h.
     """
     first = str(table.frame.columns[0])
     blank_header = first.strip() in files.BLANK_HEADERS
@@ -131,7 +129,7 @@ def _is_number(text: str) -> bool:
 
 
 def _running_index(table: files.Table, column: str) -> NDArray[np.int64]:
-    """Places on the regular grid, from 0, of a running index of whole numbers, (T,)."""
+    """Return grid positions from 0, (T,), from a running index of whole numbers."""
     index = table.numbers(column, 0.0, 1e9)
     steps = np.diff(index, prepend=index[0] - 1.0)
     wrong = ~((index == np.round(index)) & (steps >= 1.0))

@@ -1,8 +1,8 @@
-"""The clock of a simulation: years of 365 days in local standard time.
+"""Clock of a simulation: years of 365 days in local standard time.
 
-Every year begins on 1 January at 00:00 and has no 29 February and no daylight saving time, so
-that hour h of the year is the same hour of the same day in every year. Days and steps of the year
-are counted from 0.
+Every year begins on 1 January at 00:00, without 29 February and without daylight saving time.
+Hour h of the year is therefore the same hour of the same day in every year. Days and steps of the
+year are counted from 0.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ import numpy.typing as npt
 from sdc_taichi.errors import ConfigError, shortened
 
 DAYS_PER_MONTH = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
-"""Days of each month, January first."""
+"""Number of days in each month, January first."""
 FIRST_DAY_OF_MONTH = (0, *accumulate(DAYS_PER_MONTH))
-"""Day of the year on which each month begins, January first; the last entry is the whole year."""
+"""Day of the year on which each month begins, January first; the last entry is 365."""
 MONTH_OF_DAY = tuple(month for month, days in enumerate(DAYS_PER_MONTH, 1) for _ in range(days))
 """Month, 1..12, of each day of the year."""
 DAYS_PER_YEAR = FIRST_DAY_OF_MONTH[-1]
-"""Days of a year: 365."""
+"""Number of days in a year: 365."""
 HOURS_PER_YEAR = 24 * DAYS_PER_YEAR
-"""Hours of a year: 8760."""
+"""Number of hours in a year: 8760."""
 MINUTES_PER_DAY = 24 * 60
-"""Minutes of a day: 1440."""
+"""Number of minutes in a day: 1440."""
 MINUTES_PER_YEAR = MINUTES_PER_DAY * DAYS_PER_YEAR
-"""Minutes of a year: 525,600."""
+"""Number of minutes in a year: 525,600."""
 FIRST_YEAR = 2001
-"""Calendar year of the first simulated year in time stamps; it has no other meaning."""
+"""Calendar year assigned to the first simulated year in time stamps; it has no other meaning."""
 MOST_DAYS = 36_500
-"""Longest run, in days: a century."""
+"""Maximum length of a run, in days: a century."""
 
 
 def whole_steps(days: float, steps_per_hour: int, what: str = "days") -> int:
-    """Number of steps in a length of time.
+    """Return the number of steps in a duration.
 
     Args:
-        days: the length, in days.
+        days: duration, in days.
         steps_per_hour: number of steps in an hour.
-        what: name of the length, for the message.
+        what: name of the duration, for the message.
 
     Raises:
-        ConfigError: a length out of bounds, or one that makes no whole steps.
+        ConfigError: the duration is out of bounds, or is not a whole number of steps.
     """
     per_day = 24 * steps_per_hour
     steps = days * per_day
@@ -57,13 +57,13 @@ def whole_steps(days: float, steps_per_hour: int, what: str = "days") -> int:
 
 
 def day_of_year(month_day: object) -> int:
-    """Day of the year, 0..364, of a text such as ``07-01``.
+    """Return the day of the year, 0..364, of a text such as ``07-01``.
 
     Args:
         month_day: month and day, ``MM-DD``.
 
     Raises:
-        ValueError: the text is no day of a 365-day year.
+        ValueError: the text is not a day of a 365-day year.
     """
     match = re.fullmatch(r"([0-9]{1,2})-([0-9]{1,2})", str(month_day).strip())
     if match:
@@ -79,9 +79,9 @@ def day_of_year(month_day: object) -> int:
 def step_times(
     start: npt.NDArray[np.int64], steps: npt.NDArray[np.int64], steps_per_hour: int
 ) -> npt.NDArray[np.datetime64]:
-    """Local standard time at which each step begins.
+    """Return the local standard time at which each step begins.
 
-    Years are written as 2001, 2002 and so on; the 29 February of a calendar leap year is left out.
+    Years are numbered 2001, 2002 and so on; the 29 February of a calendar leap year is skipped.
 
     Args:
         start: first step of each data center, counted from the beginning of its year, (B,).
@@ -89,7 +89,7 @@ def step_times(
         steps_per_hour: number of steps in an hour.
 
     Returns:
-        Milliseconds since 1970, (n, B).
+        Time stamps in milliseconds, (n, B).
     """
     minutes = (start + steps[:, None]) * (60 // steps_per_hour)
     years, within = FIRST_YEAR + minutes // MINUTES_PER_YEAR, minutes % MINUTES_PER_YEAR
@@ -100,7 +100,7 @@ def step_times(
 
 
 def is_leap_day(times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.bool_]:
-    """Which of the calendar's times, of any shape, fall on 29 February."""
+    """Return True for each calendar time, of any shape, that is on 29 February."""
     months = times.astype("datetime64[M]")
     month = months.astype(np.int64) % 12
     day = (times.astype("datetime64[D]") - months.astype("datetime64[D]")).astype(np.int64)
@@ -108,10 +108,10 @@ def is_leap_day(times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.bool_]:
 
 
 def minutes_into_year(time: np.datetime64) -> float:
-    """Minutes of the 365-day year that have passed at a time of the calendar.
+    """Return the minutes of the 365-day year that have passed at a calendar time.
 
     Args:
-        time: any but one of 29 February.
+        time: any time that is not on 29 February.
     """
     year = time.astype("datetime64[Y]")
     minutes = float((time - year.astype(time.dtype)) / np.timedelta64(1, "m"))
@@ -122,6 +122,6 @@ def minutes_into_year(time: np.datetime64) -> float:
 
 
 def _is_leap_year(years: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Which years of the Gregorian calendar have a 29 February."""
+    """Return True for each year of the Gregorian calendar with a 29 February."""
     years = np.asarray(years, dtype=np.int64)
     return np.asarray((years % 4 == 0) & ((years % 100 != 0) | (years % 400 == 0)))

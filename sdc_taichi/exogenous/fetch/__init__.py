@@ -1,6 +1,7 @@
-"""Weather and carbon intensity from public services, as files that ``data import`` reads.
+"""Download of weather and carbon intensity from public services, as files for ``data import``.
 
-``services.yaml`` holds what is known of each service. ``download`` speaks HTTP and keeps each
-answer with its origin; ``weather`` and ``generation`` turn answers into tables, ``saved_tables``
-does so with tables that a user saved by hand; ``fetching`` joins them. No simulation uses this.
+``services.yaml`` describes the services. ``download`` sends HTTP requests and stores each answer
+with its origin. ``weather`` and ``generation`` convert answers to tables, and ``saved_tables``
+converts tables that a user saved by hand. ``fetching`` combines these steps. Simulations do not use
+this package.
 """

@@ -1,13 +1,13 @@
-"""Downloads over HTTP, stored with their origin, so that a second fetch needs no network.
+"""HTTP downloads, stored with their origin, so that a repeated fetch needs no network.
 
-A download ends within a limited time, with a whole answer or with an error of one line. After
-temporary failures (no connection, no answer, statuses 408, 425, 429 and 5xx, an answer that is cut
-off) the request is repeated, after waits that double or that the service asks for. Messages contain
-no text of the HTTP library, which would quote the address with the key.
+A download ends within a limited time, either with a complete answer or with an error of one line.
+After temporary failures (no connection, no answer, statuses 408, 425, 429 and 5xx, an incomplete
+answer) the request is repeated. The waits double each time, or follow the service's request.
+Messages never quote the HTTP library, because its text contains the address with the key.
 
-Answers are stored in the folder of imported files, under ``downloads/SERVICE``: each file as the
-service sent it, without the key, and beside it ``NAME.origin.json`` with its address, time,
-checksum and licence.
+Answers are stored in the folder of imported files, under ``downloads/SERVICE``. Each file is stored
+as the service sent it, without the key. ``NAME.origin.json`` beside it has address, time, checksum
+and licence.
 """
 
 from __future__ import annotations
@@ -38,30 +38,30 @@ if TYPE_CHECKING:
     import requests
 
 FORMAT = "sdc-download/1"
-"""Version of the files that hold origins."""
+"""Name and version of the format of origin files."""
 MOST_DOWNLOAD_BYTES = 64_000_000
-"""Largest answer of a service, in bytes: fifty times that of a typical year of PVGIS."""
+"""Largest valid answer of a service, in bytes: fifty times a typical year of PVGIS."""
 _MOST_ORIGIN_BYTES = 100_000
 _CHUNK_BYTES = 1 << 14
 _PASSING = frozenset({408, 425, 429})
-"""Statuses below 500 after which an attempt is repeated."""
+"""Statuses below 500 after which the request is repeated."""
 _KEY = re.compile(r"[A-Za-z0-9_-]{8,200}")
 
 
 @dataclass(frozen=True)
 class Patience:
-    """Limits of the time and the attempts of a download."""
+    """Limits on time and attempts of a download."""
 
     connect_s: float = 10.0
-    """Longest wait for a connection, in s."""
+    """Maximum wait for a connection, in s."""
     read_s: float = 60.0
-    """Longest wait for the next bytes of an answer, in s."""
+    """Maximum wait for the next bytes of an answer, in s."""
     total_s: float = 300.0
-    """Longest time of a download with all its attempts and waits, in s."""
+    """Maximum duration of a download with all attempts and waits, in s."""
     attempts: int = 6
-    """Largest number of attempts."""
+    """Maximum number of attempts."""
     first_wait_s: float = 1.0
-    """Longest wait after the first attempt, in s; it doubles from attempt to attempt."""
+    """Maximum wait after the first attempt, in s; it doubles after each further attempt."""
 
 
 @dataclass(frozen=True)
@@ -69,51 +69,51 @@ class Request:
     """One download from a service."""
 
     service: Service
-    """The service that is asked."""
+    """Service to which the request is sent."""
     address: str
-    """Address without query."""
+    """Address without the query."""
     file_name: str
     """Name of the file in which the answer is stored."""
     query: Mapping[str, str] = field(default_factory=dict)
-    """Parameters of the query, without the key."""
+    """Query parameters without the key."""
     key: str = field(default="", repr=False)
-    """Key of the user; empty if the service asks for none."""
+    """Key of the user; empty if the service needs none."""
     by_hand: str = ""
-    """What a user can do where the service cannot be reached, for messages."""
+    """Instructions for a download by hand, for messages if the service cannot be reached."""
     check: Callable[[bytes, str], object] = lambda content, origin: None
-    """Reads an answer, with the address for messages; raises DataError if it is not what was
-    requested."""
+    """Function ``(content, origin)`` that reads an answer, with its address for messages. It raises
+    DataError if the answer is not what was requested."""
     most_bytes: int = MOST_DOWNLOAD_BYTES
     """Largest valid answer, in bytes."""
 
     @property
     def url(self) -> str:
-        """Address with query, without the key."""
+        """Address with the query, without the key."""
         query = urlencode(self.query, quote_via=quote)
         return f"{self.address}?{query}" if query else self.address
 
     @property
     def host(self) -> str:
-        """Host that is asked."""
+        """Host to which the request is sent."""
         return urlsplit(self.address).hostname or self.address
 
 
 @dataclass(frozen=True)
 class Kept:
-    """An answer of a service that is stored in a file."""
+    """An answer of a service, stored in a file."""
 
     path: Path
-    """File that holds the answer."""
+    """File with the answer."""
     content: bytes
-    """The answer."""
+    """Bytes of the answer."""
     origin: dict[str, Any]
     """Address without the key, time in UTC, checksum, licence and publisher."""
 
 
 class _AttemptError(Exception):
-    """A failed attempt, with the wait in s that the service asks for, if any.
+    """A failed attempt, with the wait in s that the service requests, if any.
 
-    ``passes`` is false of failures after which no other attempt succeeds.
+    ``passes`` is True for a temporary failure, after which another attempt may succeed.
     """
 
     def __init__(self, reason: str, wait_s: float | None = None, *, passes: bool = True) -> None:
@@ -123,10 +123,10 @@ class _AttemptError(Exception):
 
 
 def read_key(service: Service) -> str:
-    """The user's key of a service, from its environment variable.
+    """Read the user's key of a service from its environment variable.
 
     Raises:
-        DataError: the variable is not set, or holds no key; the message does not show it.
+        DataError: the variable is not set or contains no key; the message does not show its value.
     """
     if service.key is None:
         return ""
@@ -152,40 +152,40 @@ def fetch(
     patience: Patience | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Kept]:
-    """Answers to requests, from the store or downloaded and then stored.
+    """Return answers to requests, either stored ones or new downloads, which are then stored.
 
     Args:
         requested: the requests.
         data_dir: folder of imported files instead of the user's.
-        refresh: download again what is stored.
-        patience: limits of time and attempts of each download.
-        progress: callback with the number of answers that are there, and of all.
+        refresh: True to download stored answers again.
+        patience: limits on time and attempts of each download.
+        progress: callback ``(done, total)`` with numbers of answers.
 
     Raises:
-        DataError: an answer is not available or not valid; earlier answers stay stored.
+        DataError: an answer is not available or not valid; earlier answers remain stored.
     """
     answers = []
     for done, request in enumerate(requested):
         progress(done, len(requested))
-        kept = None if refresh else _kept(request, data_dir)
-        answers.append(kept or _keep(request, download(request, patience), data_dir))
+        stored = None if refresh else _stored(request, data_dir)
+        answers.append(stored or _store(request, download(request, patience), data_dir))
     progress(len(requested), len(requested))
     return answers
 
 
 def keep_file(request: Request, path: Path, data_dir: Path | None = None) -> Kept:
-    """Keep a file that a user has downloaded as the answer to a request.
+    """Store a file that the user downloaded as the answer to a request.
 
     Raises:
         DataError: the file cannot be read, or is not what was requested.
     """
     content = read_bytes(path, request.most_bytes, DataError)
     request.check(content, str(path))
-    return _keep(request, content, data_dir)
+    return _store(request, content, data_dir)
 
 
 def write_file(path: Path, content: bytes) -> Path:
-    """Write a file made of answers; readers see the old one or the whole new one.
+    """Write a file atomically: readers see the old file or the complete new one.
 
     Raises:
         DataError: the file cannot be written.
@@ -199,7 +199,7 @@ def write_file(path: Path, content: bytes) -> Path:
 
 
 def downloads_dir(service: Service, data_dir: Path | None = None) -> Path:
-    """Folder in which answers of a service are stored."""
+    """Return the folder in which answers of a service are stored."""
     return user_data_dir(data_dir) / "downloads" / service.name
 
 
@@ -213,15 +213,15 @@ def download(
 
     Args:
         request: the request.
-        patience: limits of time and attempts.
-        sleep: waits for a number of seconds.
+        patience: limits on time and attempts.
+        sleep: function that waits for a number of seconds.
 
     Returns:
-        The answer without the key, which some services repeat in it.
+        The answer without the key, which some services repeat in their answers.
 
     Raises:
-        DataError: no answer in time, an answer that is too large or not what was requested, or no
-            library for HTTP.
+        DataError: no answer came in time, the answer is too large or not what was requested, or
+            the HTTP library is not installed.
     """
     try:
         import requests
@@ -237,15 +237,15 @@ def download(
             try:
                 return _attempt(session, request, patience, end)
             except _AttemptError as failed:
-                reason, asked_s, passes = str(failed), failed.wait_s, failed.passes
+                reason, retry_s, passes = str(failed), failed.wait_s, failed.passes
             if not passes:
                 raise DataError(f"{request.host}: {reason}{by_hand}")
             longest_s = patience.first_wait_s * 2 ** (attempt - 1)
-            wait_s = random.uniform(0.5, 1.0) * longest_s if asked_s is None else asked_s
+            wait_s = random.uniform(0.5, 1.0) * longest_s if retry_s is None else retry_s
             if time.monotonic() + wait_s > end:
-                asked = f", and asks to wait {asked_s:,.0f} s" if asked_s else ""
+                retry = f", and asks to wait {retry_s:,.0f} s" if retry_s else ""
                 raise DataError(
-                    f"{request.host}: {reason}{asked}; no answer within {patience.total_s:g} s, "
+                    f"{request.host}: {reason}{retry}; no answer within {patience.total_s:g} s, "
                     f"try later{by_hand}"
                 )
             if attempt < patience.attempts:
@@ -264,7 +264,7 @@ def _attempt(session: requests.Session, request: Request, patience: Patience, en
             params=urlencode(query, quote_via=quote),
             timeout=(patience.connect_s, patience.read_s),
             stream=True,
-            # Keys of a .netrc file are for other uses.
+            # Prevent the use of credentials in a .netrc file, which are for other purposes.
             auth=lambda prepared: prepared,
         )
     with contextlib.closing(response), _naming_failures(patience):
@@ -294,10 +294,11 @@ def _refuse(request: Request, response: requests.Response, content: bytes) -> No
     status = response.status_code
     phrase = next((f" ({each.phrase})" for each in HTTPStatus if each == status), "")
     if status in _PASSING or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-        asked = response.headers.get("Retry-After", "")
-        raise _AttemptError(f"status {status}{phrase}", float(asked) if asked.isdecimal() else None)
+        retry_after = response.headers.get("Retry-After", "")
+        wait_s = float(retry_after) if retry_after.isdecimal() else None
+        raise _AttemptError(f"status {status}{phrase}", wait_s)
     text = content[:10_000].decode("utf-8", errors="replace")
-    # Services explain an error in JSON ("message", "error") or in XML (<text>).
+    # Services explain errors in JSON ("message", "error") or in XML (<text>).
     message = re.search(r'"(?:message|error)"\s*:\s*"(.*?)"|<text>(.*?)</text>', text, re.DOTALL)
     explained = f": {shortened(message[1] or message[2], 200)}" if message else ""
     if request.service.key and status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
@@ -311,7 +312,7 @@ def _refuse(request: Request, response: requests.Response, content: bytes) -> No
 
 @contextlib.contextmanager
 def _naming_failures(patience: Patience) -> Iterator[None]:
-    """Turn failures of the HTTP library into reasons without its text, which may hold the key."""
+    """Convert failures of the HTTP library to reasons without its text, which may show the key."""
     import requests.exceptions as failures
     from urllib3.exceptions import NameResolutionError
 
@@ -334,14 +335,14 @@ def _naming_failures(patience: Patience) -> Iterator[None]:
         reason = "no connection" if passes else "not found (is there a network?)"
     except failures.RequestException:
         reason, passes = "no valid address, or too many redirects", False
-    # Outside of the handlers, so that no traceback shows the text of the library.
+    # Raise outside of the handlers, so that no traceback shows the text of the library.
     if reason:
         raise _AttemptError(reason, passes=passes)
 
 
 @contextlib.contextmanager
 def _without_key_in_logs(key: str) -> Iterator[None]:
-    """Keep the key out of the debugging log of the HTTP library."""
+    """Hide the key in the debug log of the HTTP library."""
 
     def hide(record: logging.LogRecord) -> bool:
         if key:
@@ -357,26 +358,26 @@ def _without_key_in_logs(key: str) -> Iterator[None]:
 
 
 def _paths(request: Request, data_dir: Path | None) -> tuple[Path, Path]:
-    """Files of an answer and of its origin."""
+    """Return the paths of an answer and of its origin file."""
     path = downloads_dir(request.service, data_dir) / request.file_name
     return path, path.with_name(f"{path.name}.origin.json")
 
 
-def _kept(request: Request, data_dir: Path | None) -> Kept | None:
-    """The stored answer; None if there is none, or it is damaged or belongs to another request."""
+def _stored(request: Request, data_dir: Path | None) -> Kept | None:
+    """Return the stored answer; None if it is absent, damaged, or of another request."""
     path, origin_path = _paths(request, data_dir)
     if not (path.is_file() and origin_path.is_file()):
         return None
     try:
         origin = json.loads(read_bytes(origin_path, _MOST_ORIGIN_BYTES, DataError))
         content = read_bytes(path, request.most_bytes, DataError)
-        asked = {"format": FORMAT, "url": request.url, "sha256": _sha256(content)}
-        return Kept(path, content, origin) if asked.items() <= origin.items() else None
+        expected = {"format": FORMAT, "url": request.url, "sha256": _sha256(content)}
+        return Kept(path, content, origin) if expected.items() <= origin.items() else None
     except (ValueError, AttributeError):
         return None
 
 
-def _keep(request: Request, content: bytes, data_dir: Path | None) -> Kept:
+def _store(request: Request, content: bytes, data_dir: Path | None) -> Kept:
     path, origin_path = _paths(request, data_dir)
     origin = {
         "format": FORMAT,

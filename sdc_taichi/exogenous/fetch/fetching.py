@@ -1,4 +1,4 @@
-"""From a service to a site: downloads, conversion, and the import that every file goes through."""
+"""Import from services: download the data of a site, convert them, and import them like files."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ from sdc_taichi.user_file import decoding
 
 @dataclass(frozen=True)
 class Destination:
-    """The site that fetched data become part of, and how they are fetched."""
+    """The site to which fetched data are added, and options of the download."""
 
     site: str
     """Name of the site."""
     base: str | None = None
-    """Embedded site that gives what the data do not; None if none does."""
+    """Embedded site that supplies missing data; None for no base."""
     data_dir: Path | None = None
     """Folder of imported files instead of the user's."""
     refresh: bool = False
-    """Whether to download again what is stored."""
+    """True to download stored answers again."""
     patience: Patience | None = None
-    """Limits of time of each download; None are the usual ones."""
+    """Limits on time and attempts of each download; None for the defaults."""
     progress: Callable[[int, int], None] = lambda done, total: None
-    """Callback with the number of downloads that are there, and of all."""
+    """Callback ``(done, total)`` with numbers of downloads."""
 
     @contextlib.contextmanager
     def checking(self) -> Iterator[None]:
-        """Add to errors of the reader how to download the data again.
+        """Add to a reader's errors how to download the data again.
 
         Raises:
-            DataError: in place of one without the hint.
+            DataError: the original error, with the hint.
         """
         try:
             yield
@@ -61,7 +61,7 @@ class Destination:
             raise DataError(f"{error}; --refresh downloads it again") from None
 
     def downloads(self, requested: Sequence[Request]) -> list[Kept]:
-        """Answers to requests, downloaded or from the store."""
+        """Return answers to requests, either stored or downloaded."""
         return fetch(
             requested,
             self.data_dir,
@@ -78,29 +78,29 @@ def fetch_pvgis(
     utc_offset_h: float,
     file: Path | None = None,
 ) -> importing.Imported:
-    """Weather of a typical year of PVGIS.
+    """Fetch the weather of a typical year from PVGIS.
 
     Args:
-        into: the site.
+        into: site to which the weather is added.
         latitude_deg: latitude, in degrees north.
         longitude_deg: longitude, in degrees east.
         utc_offset_h: local standard time minus UTC, in h.
-        file: answer of PVGIS that was downloaded by hand; None to download it.
+        file: PVGIS answer that the user downloaded; None to download it.
 
     Raises:
-        DataError: no typical year is available, or it is not valid.
+        DataError: the typical year is not available or not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
     request = weather.request_year(latitude_deg, longitude_deg)
     weather.check_offset(utc_offset_h, longitude_deg)
     if file is not None:
-        kept = keep_file(request, file, into.data_dir)
+        answer = keep_file(request, file, into.data_dir)
     else:
-        (kept,) = into.downloads([request])
-    table, place = weather.typical_year(kept.content, request.url, utc_offset_h)
-    path = kept.path.with_name(f"{kept.path.stem}_utc{utc_offset_h:+g}.csv")
+        (answer,) = into.downloads([request])
+    table, place = weather.typical_year(answer.content, request.url, utc_offset_h)
+    path = answer.path.with_name(f"{answer.path.stem}_utc{utc_offset_h:+g}.csv")
     write_file(path, table)
-    origin = _origin(request.service, [kept], ["moved from UTC to local standard time"])
+    origin = _origin(request.service, [answer], ["moved from UTC to local standard time"])
     with into.checking():
         return importing.import_weather(
             path, name, into.base, into.data_dir, place=place, origin=origin
@@ -108,22 +108,22 @@ def fetch_pvgis(
 
 
 def fetch_epw(into: Destination, url: str) -> importing.Imported:
-    """Weather of an EPW file at an address.
+    """Fetch the weather of an EPW file from an address.
 
     Args:
-        into: the site.
-        url: address of the file, or of a ZIP archive that holds it.
+        into: site to which the weather is added.
+        url: address of the file, or of a ZIP archive that contains it.
 
     Raises:
-        DataError: no EPW file is available, or it is not valid.
+        DataError: the EPW file is not available or not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
     request = weather.request_epw(url)
-    (kept,) = into.downloads([request])
-    path, plain = kept.path, weather.epw_bytes(kept.content, url)
-    if plain is not kept.content:
+    (answer,) = into.downloads([request])
+    path, plain = answer.path, weather.epw_bytes(answer.content, url)
+    if plain is not answer.content:
         path = write_file(path.with_name(f"{path.stem}.unpacked.epw"), plain)
-    origin = _origin(request.service, [kept])
+    origin = _origin(request.service, [answer])
     with into.checking():
         return importing.import_weather(path, name, into.base, into.data_dir, origin=origin)
 
@@ -135,26 +135,26 @@ def fetch_generation(
     year: int,
     utc_offset_h: float | None = None,
 ) -> importing.Imported:
-    """Carbon intensity of an area, by its generation in a calendar year.
+    """Fetch the carbon intensity of an area, from its generation in a calendar year.
 
     Args:
-        into: the site.
+        into: site to which the carbon intensity is added.
         service_name: ``eia-930`` or ``entsoe``.
-        area: code of a balancing authority of the USA, such as ``CISO``; name of a zone of Europe,
-            such as ``DE_LU``, or its energy identification code.
+        area: code of a US balancing authority, such as ``CISO``; or name of a European zone, such
+            as ``DE_LU``, or its energy identification code.
         year: calendar year, in UTC.
-        utc_offset_h: of the site, in h; None is that of its weather or base.
+        utc_offset_h: UTC offset of the site, in h; None stands for that of its weather or base.
 
     Raises:
-        DataError: no key, or the generation is not available or not valid.
+        DataError: there is no key, or the generation is not available or not valid.
     """
     service = services()[service_name]
     _check(into, service, year, utc_offset_h)
     code, periods, requested = year_of_requests(service, area, year)
-    kept = into.downloads(requested)
+    answers = into.downloads(requested)
     parts = [
         read_generation(service, period, answer.content, request.url)
-        for period, answer, request in zip(periods, kept, requested, strict=True)
+        for period, answer, request in zip(periods, answers, requested, strict=True)
     ]
     table, notes = carbon_table(parts, service)
     path = write_file(downloads_dir(service, into.data_dir) / f"{code}_{year}.csv", table)
@@ -166,7 +166,7 @@ def fetch_generation(
             into.data_dir,
             utc_offset_h=utc_offset_h,
             stamp=service.stamp,
-            origin=_origin(service, kept, notes),
+            origin=_origin(service, answers, notes),
         )
 
 
@@ -177,14 +177,14 @@ def fetch_electricity_maps(
     utc_offset_h: float | None = None,
     release: str = ELECTRICITY_MAPS_RELEASE,
 ) -> importing.Imported:
-    """Carbon intensity of a zone by a yearly table of Electricity Maps.
+    """Fetch the carbon intensity of a zone from a yearly table of Electricity Maps.
 
     Args:
-        into: the site.
-        zone: zone as Electricity Maps calls it, such as ``FR`` or ``US-CAL-CISO``.
+        into: site to which the carbon intensity is added.
+        zone: name of the zone in Electricity Maps, such as ``FR`` or ``US-CAL-CISO``.
         year: calendar year, in UTC.
-        utc_offset_h: of the site, in h; None is that of its weather or base.
-        release: day of the release of the table.
+        utc_offset_h: UTC offset of the site, in h; None stands for that of its weather or base.
+        release: release date of the table.
 
     Raises:
         DataError: the table is not available or not valid.
@@ -206,22 +206,22 @@ def fetch_electricity_maps(
         "--map electricity-maps",
         check=_intensity_columns,
     )
-    (kept,) = into.downloads([request])
+    (answer,) = into.downloads([request])
     with into.checking():
         return importing.import_carbon(
-            kept.path,
+            answer.path,
             into.site,
             into.base,
             into.data_dir,
             utc_offset_h=utc_offset_h,
             stamp=service.stamp,
-            columns=_intensity_columns(kept.content, request.url),
-            origin=_origin(service, [kept]),
+            columns=_intensity_columns(answer.content, request.url),
+            origin=_origin(service, [answer]),
         )
 
 
 def _intensity_columns(content: bytes, url: str) -> dict[str, str]:
-    """Columns of a table of Electricity Maps, by the names of the reader."""
+    """Return the column names of a table of Electricity Maps, by the names of the reader."""
     layout = services()["electricity-maps"].saved_table
     assert layout is not None
     assert layout.intensity is not None
@@ -242,7 +242,7 @@ def _intensity_columns(content: bytes, url: str) -> dict[str, str]:
 
 
 def _check(into: Destination, service: Service, year: int, utc_offset_h: float | None) -> None:
-    """Check, before any download, that the year has ended and the site has a name and a clock."""
+    """Check, before any download, that the year has ended, and the site's name and UTC offset."""
     this_year, first = datetime.now(UTC).year, service.first_year or 0
     if not first <= year < this_year:
         raise DataError(

@@ -1,8 +1,8 @@
-"""Generation by type of energy, of EIA-930 and ENTSO-E, as tables that ``read_carbon`` reads.
+"""Generation by energy source from EIA-930 and ENTSO-E, as tables that ``read_carbon`` reads.
 
-EIA-930 reports MWh of an hour, by balancing authorities of the USA. ENTSO-E (article 16.1.B&C,
-document A75) reports mean power in MW of bidding zones and countries of Europe, in intervals of
-15, 30 or 60 minutes that begin at their stamp, which are averaged to hours. Stamps are in UTC.
+EIA-930 reports MWh per hour for balancing authorities of the USA. ENTSO-E (article 16.1.B&C,
+document A75) reports mean power in MW for bidding zones and countries of Europe. Its intervals of
+15, 30 or 60 minutes begin at their stamp and are averaged to hours here. Stamps are in UTC.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_EIA_ROWS = 5000
-"""Largest number of rows of an answer of EIA-930."""
+"""Maximum number of rows in an answer of EIA-930."""
 _EIA_FIRST_DAYS = (1, 11, 21)
-"""Days of a month on which a request to EIA-930 begins: 11 days of 18 sources are 4,752 rows."""
+"""First days, within a month, of requests to EIA-930; 11 days of 18 sources have 4,752 rows."""
 _RESOLUTION_MIN = {"PT15M": 15, "PT30M": 30, "PT60M": 60, "PT1H": 60}
 _SLOT_MIN = 15
-"""Length of the slots that intervals of ENTSO-E are divided into, in minutes."""
+"""Length of the time slots into which intervals of ENTSO-E are divided, in minutes."""
 _MOST_INTERVALS = 366 * 24 * 60 // _SLOT_MIN
 _VARIABLE_BLOCKS = "A03"
-"""Curve whose points are left out where the value stays (variable sized block)."""
+"""Code of curves in which repeated values are omitted (variable sized block)."""
 
 
 class Period(NamedTuple):
@@ -47,10 +47,10 @@ class Period(NamedTuple):
     first: date
     """First day."""
     stop: date
-    """Day after the last."""
+    """Day after the last day."""
 
     def hours(self) -> pd.DatetimeIndex:
-        """Beginning of each hour."""
+        """Return the beginning of each hour."""
         import pandas as pd
 
         return pd.date_range(self.first, self.stop, freq="h", inclusive="left")
@@ -62,13 +62,13 @@ class YearOfRequests(NamedTuple):
     area: str
     """Code of the area, for file names."""
     periods: list[Period]
-    """Part of the year of each request."""
+    """Period of the year that each request covers."""
     requests: list[Request]
-    """The requests."""
+    """Requests, one for each period."""
 
 
 def year_of_requests(service: Service, area: str, year: int) -> YearOfRequests:
-    """Requests of the generation in an area in a calendar year.
+    """Build the requests for the generation in an area in a calendar year.
 
     Args:
         service: EIA-930 or ENTSO-E.
@@ -76,7 +76,7 @@ def year_of_requests(service: Service, area: str, year: int) -> YearOfRequests:
         year: calendar year, in UTC.
 
     Raises:
-        DataError: no such area, or no key.
+        DataError: the area is unknown, or there is no key.
     """
     is_eia = service.name == "eia-930"
     code = _authority(area) if is_eia else zone_code(area)
@@ -122,10 +122,10 @@ def _authority(area: str) -> str:
 
 
 def zone_code(zone: str) -> str:
-    """Energy identification code of a zone of ENTSO-E by its name, or the code itself.
+    """Return the energy identification code of an ENTSO-E zone, given its name or code.
 
     Raises:
-        DataError: neither a name nor a code.
+        DataError: the text is neither a name nor a code.
     """
     zones = services()["entsoe"].zones
     name = zone.strip().upper().replace("-", "_")
@@ -140,20 +140,20 @@ def zone_code(zone: str) -> str:
 
 
 def read_generation(service: Service, period: Period, content: bytes, url: str) -> pd.DataFrame:
-    """Generation of each type in each hour of an answer.
+    """Read the generation of each type in each hour from an answer.
 
     Args:
         service: EIA-930 or ENTSO-E.
-        period: days that were asked for.
+        period: days that were requested.
         content: the answer.
         url: address, for messages.
 
     Returns:
-        MWh in the hour by code of the type, indexed by the beginning of the hours in UTC as the
-        service stamps them; NaN where it is not reported.
+        MWh per hour by type code, indexed by the service's UTC stamps of the hours; NaN for values
+        that are not reported.
 
     Raises:
-        DataError: names the address, row, field and value of what is wrong.
+        DataError: the answer is not valid; the message names address, row, field and value.
     """
     if service.name == "eia-930":
         return _eia_generation(content, url, period.hours())
@@ -161,11 +161,11 @@ def read_generation(service: Service, period: Period, content: bytes, url: str) 
 
 
 def hourly_means(table: pd.DataFrame, hours: pd.DatetimeIndex, minutes: int) -> pd.DataFrame:
-    """Means of each hour of a table; NaN where a part of the hour is missing.
+    """Return hourly means of a table; NaN if a part of the hour is missing.
 
     Args:
         table: values indexed by stamps that are multiples of ``minutes``.
-        hours: the hours, without gaps.
+        hours: contiguous hours of the result.
         minutes: resolution of the table, a divisor of 60.
     """
     import pandas as pd
@@ -177,10 +177,10 @@ def hourly_means(table: pd.DataFrame, hours: pd.DatetimeIndex, minutes: int) -> 
 
 
 def eia_rows(content: bytes, url: str) -> list[dict[str, Any]]:
-    """Rows of an answer of EIA-930.
+    """Parse the rows of an answer of EIA-930.
 
     Raises:
-        DataError: another format, rows that are left out, or none.
+        DataError: the format is unknown, rows are missing, or there are none.
     """
     with decoding(url, "JSON", DataError):
         answer = json.loads(content)
@@ -200,7 +200,7 @@ def eia_rows(content: bytes, url: str) -> list[dict[str, Any]]:
 
 
 def _eia_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.DataFrame:
-    """Hourly generation by type of an answer of EIA-930."""
+    """Return hourly generation by type from an answer of EIA-930."""
     import pandas as pd
 
     rows = pd.DataFrame(eia_rows(content, url))
@@ -218,7 +218,7 @@ def _eia_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.Dat
 
 
 def _entsoe_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.DataFrame:
-    """Hourly generation by type of an answer of ENTSO-E, which may hold more hours."""
+    """Return hourly generation by type for ``hours``, from an answer of ENTSO-E."""
     import pandas as pd
 
     by_type: dict[str, pd.Series[float]] = {}
@@ -230,9 +230,9 @@ def _entsoe_generation(content: bytes, url: str, hours: pd.DatetimeIndex) -> pd.
 
 
 def _entsoe_runs(content: bytes, url: str) -> list[tuple[str, datetime, FloatArray]]:
-    """Type, start and mean power in MW, in slots, of each run of intervals of an answer.
+    """Return type, start, and mean power in MW per slot, of each run of intervals in an answer.
 
-    What storage consumes is left out.
+    Consumption of storage is skipped.
     """
     with decoding(url, "XML", DataError):
         root = ElementTree.fromstring(content)
@@ -264,7 +264,7 @@ def _entsoe_runs(content: bytes, url: str) -> list[tuple[str, datetime, FloatArr
 def _run(
     period: ElementTree.Element, kind: str, *, repeated: bool, url: str
 ) -> tuple[datetime, FloatArray]:
-    """Start and power in MW, in slots, of an element Period."""
+    """Parse an element Period; return its start and its power in MW per slot."""
     resolution = _text(period, "resolution", url)
     minutes = _RESOLUTION_MIN.get(resolution)
     if minutes is None:
@@ -294,14 +294,14 @@ def _run(
 
 
 def _time(text: str, url: str) -> datetime:
-    """A time in UTC by its stamp, such as 2024-01-31T23:00Z."""
+    """Parse a UTC time such as 2024-01-31T23:00Z."""
     with contextlib.suppress(ValueError):
         return datetime.strptime(re.sub(r"(:\d\d):00Z$", r"\1Z", text), "%Y-%m-%dT%H:%MZ")
     raise DataError(f"{url}: time {shortened(text)}, expected one such as 2024-01-31T23:00Z")
 
 
 def _text(element: ElementTree.Element, name: str, url: str) -> str:
-    """Text of the first descendant element with a name."""
+    """Return the text of the first descendant element with a given name."""
     text = next((x.text for x in element.iter(name) if x.text), None)
     if text is None:
         raise DataError(f"{url}: no {name}, so the format is not the one known here")
@@ -309,16 +309,16 @@ def _text(element: ElementTree.Element, name: str, url: str) -> str:
 
 
 def carbon_table(parts: Sequence[pd.DataFrame], service: Service) -> tuple[bytes, list[str]]:
-    """A carbon table as CSV, its average intensity by the factors of this package, and notes.
+    """Convert generation to a carbon table as CSV, with intensity by our factors, and notes.
 
-    Services leave out what an area does not have, so a type counts as 0 in more than a day before
-    its first and after its last value, and in parts without any value of it. Other hours stay
-    missing, for the reader to fill or to refuse.
+    Services omit types that an area does not have. A type therefore counts as 0 before its first
+    and after its last value, if that lasts more than a day, and in parts without any value of it.
+    Other missing hours remain missing; the reader fills or refuses them.
 
     Args:
-        parts: contiguous parts of the time, each with the generation of its hours in MWh by type,
-            indexed by stamps in UTC; NaN is missing.
-        service: its types and the columns that they count as.
+        parts: contiguous parts of the time, each with hourly generation in MWh by type, indexed by
+            stamps in UTC; NaN for missing values.
+        service: service with its types and the columns as which they count.
     """
     import pandas as pd
 
@@ -345,7 +345,7 @@ def carbon_table(parts: Sequence[pd.DataFrame], service: Service) -> tuple[bytes
             notes.append(f"{int(below.sum())} negative values of {name} set to 0")
             series[below] = 0.0
         values[:, FUELS.index(column)] += series
-    # An hour of which nothing at all is known.
+    # Hours without any known generation are missing.
     values[~(np.nansum(values, axis=1) > 0.0)] = np.nan
     factors = np.array([emission_factors()[fuel] for fuel in FUELS])
     intensity = values @ factors / values.sum(axis=1)
@@ -358,11 +358,11 @@ def carbon_table(parts: Sequence[pd.DataFrame], service: Service) -> tuple[bytes
 
 
 def _absent(series: FloatArray, lengths: Sequence[int]) -> NDArray[np.bool_]:
-    """Hours in which a type of energy is not reported rather than missing, (T,).
+    """Return True for each hour in which the area does not have an energy type, (T,).
 
     Args:
-        series: generation of the type, (T,).
-        lengths: number of hours of each part.
+        series: generation of the type, NaN for missing values, (T,).
+        lengths: number of hours in each part.
     """
     missing = np.isnan(series)
     absent = np.zeros(missing.size, dtype=bool)

@@ -1,7 +1,8 @@
-"""Tables of carbon intensity and generation that were saved by hand from the pages of services.
+"""Import of tables of carbon intensity and generation that users saved from services' pages.
 
-Each service has its own layout (``services.yaml``). A table is converted to the carbon table that
-``read_carbon`` reads, which is stored beside the downloads of the service and imported like them.
+``services.yaml`` describes the layout of each service. A table is converted to the carbon table
+that ``read_carbon`` reads. The carbon table is stored beside the downloads of the service and
+imported like them.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ _MOST_MW = 1e7
 _LONGEST_LIST = 12
 _BRUSSELS = "Europe/Brussels"
 _INTERVAL = r"^(\d\d)[./](\d\d)[./](\d{4}) (\d\d:\d\d)(?::\d\d)?(?: \((CET|CEST|UTC)\))? - .*$"
-"""Interval of a table of ENTSO-E: day, month, year, time, and a mark where clocks go back."""
+"""Pattern of an interval in tables of ENTSO-E: day, month, year, time, and optional time zone."""
 
 
 def saved_table_services() -> dict[str, Service]:
-    """Services whose saved tables can be imported, by name."""
+    """Return the services whose saved tables can be imported, by name."""
     return {name: each for name, each in services().items() if each.saved_table is not None}
 
 
 def find_service(name: str) -> Service:
-    """A service whose saved tables can be imported.
+    """Return a service whose saved tables can be imported.
 
     Raises:
-        DataError: no such service.
+        DataError: there is no such service.
     """
     valid = saved_table_services()
     if name not in valid:
@@ -64,16 +65,16 @@ def import_saved_tables(
     """Import tables of a service as the carbon intensity of a site.
 
     Args:
-        paths: the files, which are joined in the order of their stamps.
-        service_name: name of the service, of ``saved_table_services``.
+        paths: files of the tables, which are joined in the order of their stamps.
+        service_name: name of the service, one of ``saved_table_services``.
         site: name of the site.
-        base: embedded site that gives what the tables do not.
+        base: embedded site that supplies missing data.
         data_dir: folder of imported files instead of the user's.
-        area: balancing authority or zone, of tables that hold several.
-        utc_offset_h: of the site, in h; None is that of its weather or base.
+        area: balancing authority or zone, for tables with several.
+        utc_offset_h: UTC offset of the site, in h; None stands for that of its weather or base.
 
     Raises:
-        DataError: names file, row, column, value and what would be valid.
+        DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     service = find_service(service_name)
     name = importing.site_name(site, data_dir)
@@ -97,7 +98,7 @@ def import_saved_tables(
 
 
 def _read(path: Path, service: Service, area: str | None) -> files.Table:
-    """Rows of an area in a file."""
+    """Read the rows of one area from a file."""
     layout = _layout(service)
     table = files.read_table(path)
     if layout.area is None:
@@ -109,8 +110,8 @@ def _read(path: Path, service: Service, area: str | None) -> files.Table:
     known = sorted(set(names))
     if area is None and len(known) == 1:
         return table
-    asked = (area or "").upper()
-    chosen = [name for name in known if asked in (name.upper(), name.upper().split("|")[-1])]
+    wanted_area = (area or "").upper()
+    chosen = [name for name in known if wanted_area in (name.upper(), name.upper().split("|")[-1])]
     if len(chosen) != 1:
         some = ", ".join(known[:_LONGEST_LIST]) + (", ..." * (len(known) > _LONGEST_LIST))
         value = "" if area is None else f" {shortened(area)}"
@@ -124,7 +125,7 @@ def _layout(service: Service) -> SavedTable:
 
 
 def _column(table: files.Table, pattern: str, expected: str) -> str:
-    """Name of the first column that a pattern fits."""
+    """Return the name of the first column that matches a pattern."""
     for name in table.frame.columns:
         if re.fullmatch(pattern, name):
             return str(name)
@@ -135,7 +136,7 @@ def _column(table: files.Table, pattern: str, expected: str) -> str:
 
 
 def _intensity_table(tables: Sequence[files.Table], service: Service) -> tuple[bytes, list[str]]:
-    """Carbon table, and notes, of tables of intensities."""
+    """Convert tables of intensities to a carbon table; return it as CSV, with notes."""
     import pandas as pd
 
     layout = _layout(service)
@@ -157,7 +158,7 @@ def _intensity_table(tables: Sequence[files.Table], service: Service) -> tuple[b
 
 
 def _stamps(table: files.Table, column: str, layout: SavedTable) -> pd.DatetimeIndex:
-    """Stamps of a column, in UTC."""
+    """Return the stamps of a column, in UTC."""
     import pandas as pd
 
     stamps, _ = table.stamps(column, layout.time_format)
@@ -166,7 +167,7 @@ def _stamps(table: files.Table, column: str, layout: SavedTable) -> pd.DatetimeI
 
 
 def _generation_table(tables: Sequence[files.Table], service: Service) -> tuple[bytes, list[str]]:
-    """Carbon table, and notes, of tables of generation that are parts of a year."""
+    """Convert tables of generation, parts of a year, to a carbon table as CSV, with notes."""
     import pandas as pd
 
     parts = sorted((_by_type(table, service) for table in tables), key=lambda part: part.index[0])
@@ -182,7 +183,7 @@ def _generation_table(tables: Sequence[files.Table], service: Service) -> tuple[
 
 
 def _by_type(table: files.Table, service: Service) -> pd.DataFrame:
-    """Hourly generation of a table by type, in MWh, indexed by stamps in UTC."""
+    """Return the hourly generation in a table by type, in MWh, indexed by stamps in UTC."""
     import pandas as pd
 
     layout = _layout(service)
@@ -204,13 +205,13 @@ def _by_type(table: files.Table, service: Service) -> pd.DataFrame:
     by_type: dict[str, Any] = {}
     for column, code in codes.items():
         series = pd.Series(numbers.numbers(column, -_MOST_MW, _MOST_MW), index=stamps)
-        # Where a type has several columns, those without a value count as 0.
+        # If a type has several columns, missing values in some of them count as 0.
         by_type[code] = by_type[code].add(series, fill_value=0.0) if code in by_type else series
     return _hourly(table.path, pd.DataFrame(by_type).sort_index())
 
 
 def _generation_columns(table: files.Table, layout: SavedTable) -> dict[str, str]:
-    """Name of the type of each column of generation."""
+    """Return the type name of each column of generation."""
     for pattern in layout.generation:
         fits = {
             str(name): match[1].strip()
@@ -223,10 +224,10 @@ def _generation_columns(table: files.Table, layout: SavedTable) -> dict[str, str
 
 
 def _code(table: files.Table, kind: str, service: Service) -> str:
-    """Code of a type by its name, or by the longest beginning of it that is known."""
+    """Return the code of a type, given its name or a longer name that begins with it."""
     kind = " ".join(kind.split())
     codes = {name: code for code, each in service.types.items() for name in each.names}
-    # Services rename and split types now and then: "Solar without Integrated Battery Storage".
+    # Services sometimes rename or split types: "Solar without Integrated Battery Storage".
     begins = [name for name in codes if kind.startswith(name)]
     if not begins:
         raise DataError(
@@ -237,17 +238,17 @@ def _code(table: files.Table, kind: str, service: Service) -> str:
 
 
 def _with_column_per_type(table: files.Table, layout: SavedTable, time: str) -> files.Table:
-    """Table with a column for each type, of one with a row for each type."""
+    """Convert a table with one row per type to a table with one column per type."""
     import pandas as pd
 
     assert layout.type is not None
     assert layout.value is not None
     frame, value = table.frame, _column(table, layout.value, "Generation (MW)")
-    # An hour that comes twice, where clocks go back: the order of its rows distinguishes them.
-    again = frame.groupby([time, layout.type], sort=False).cumcount()
-    keys = [frame[time], again.rename("_again")]
+    # When clocks go back, an hour occurs twice; the order of its rows distinguishes the two.
+    repetition = frame.groupby([time, layout.type], sort=False).cumcount()
+    keys = [frame[time], repetition.rename("_again")]
     rows = frame.index.to_series().groupby(keys, sort=False).first()
-    wide = frame.assign(_again=again).pivot(
+    wide = frame.assign(_again=repetition).pivot(
         index=[time, "_again"], columns=layout.type, values=value
     )
     wide = wide.fillna("").reindex(rows.index)
@@ -259,7 +260,7 @@ def _with_column_per_type(table: files.Table, layout: SavedTable, time: str) -> 
 def _interval_starts(
     table: files.Table, layout: SavedTable, column: str, values: list[str]
 ) -> tuple[files.Table, pd.DatetimeIndex]:
-    """Rows whose interval exists, and the starts of these intervals in UTC."""
+    """Return the rows whose interval exists, and the starts of these intervals in UTC."""
     import pandas as pd
 
     text = table.frame[column].str.strip()
@@ -272,7 +273,7 @@ def _interval_starts(
     if "UTC" in column or text.iloc[0].endswith("(UTC)"):
         return table, pd.DatetimeIndex(naive)
     is_summer = parts[4].map({"CEST": True, "CET": False})
-    # Tables without marks have the two hours in order.
+    # In tables without time zones, the two hours at the end of summer time are in order.
     ambiguous: Any = "infer"
     if is_summer.notna().any():
         ambiguous = is_summer.eq(other=True).to_numpy(dtype=bool)
@@ -293,7 +294,7 @@ def _interval_starts(
 
 
 def _hourly(path: Path | str, table: pd.DataFrame) -> pd.DataFrame:
-    """Hourly means of a table of 15, 30 or 60 minutes."""
+    """Return hourly means of a table with intervals of 15, 30 or 60 minutes."""
     import pandas as pd
 
     steps = np.diff(table.index.to_numpy()).astype("timedelta64[m]").astype(int)
@@ -305,7 +306,7 @@ def _hourly(path: Path | str, table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _refuse_repeated(path: Path | str, stamps: pd.Index) -> None:
-    again = stamps.duplicated()
-    if again.any():
-        at = stamps[int(np.argmax(again))]
+    is_repeated = stamps.duplicated()
+    if is_repeated.any():
+        at = stamps[int(np.argmax(is_repeated))]
         raise DataError(f"{path}: {at} UTC comes twice, in this file or another one of the import")

@@ -1,4 +1,4 @@
-"""Public services of weather and carbon intensity, as ``services.yaml`` describes them."""
+"""Descriptions of public services of weather and carbon intensity, from ``services.yaml``."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from sdc_taichi.exogenous.stamps import Stamp
 
 ELECTRICITY_MAPS_RELEASE = "2025-04-03"
-"""Release of the tables of Electricity Maps unless another is named; it has 2021 to 2024."""
+"""Default release of the tables of Electricity Maps, with the years 2021 to 2024."""
 STORAGE = "storage"
-"""What a kind of generation counts as that only gives back what was generated before."""
+"""Value of ``as`` for types that only return energy generated earlier."""
 
 
 class _Record(BaseModel):
@@ -21,55 +21,55 @@ class _Record(BaseModel):
 
 
 class KeySource(_Record):
-    """Where the key of a service comes from and goes to."""
+    """Source of the key of a service, and its place in the query."""
 
     variable: str
-    """Environment variable that holds the key."""
+    """Environment variable with the key."""
     parameter: str
-    """Parameter of the query that carries the key."""
+    """Query parameter for the key."""
 
 
 class GenerationType(_Record):
-    """A kind of generation."""
+    """A type of generation of a service."""
 
     counts_as: str = Field(alias="as")
-    """Column of a carbon table, or ``storage``."""
+    """Column of the carbon table to which the type counts, or ``storage``."""
     names: tuple[str, ...] = ()
-    """Beginnings of its names in tables that were saved by hand."""
+    """First words of the type's names in tables that users saved."""
 
 
 class SavedTable(_Record):
-    """Layout of tables saved by hand from the pages of a service.
+    """Layout of tables that users saved from the pages of a service.
 
-    Names of columns are regular expressions. A table has intensities, or generation with a column
-    for each type or with a row for each type.
+    Column names are regular expressions. A table contains either intensities or generation, the
+    latter with a column for each type or with a row for each type.
     """
 
     time: str
     """Column of the stamps or intervals."""
     time_format: str = "ISO8601"
-    """Format of stamps, as of ``strptime``."""
+    """Format of stamps, in the syntax of ``strptime``."""
     time_example: str = "2023-01-01 00:00"
     """A valid time, for messages."""
     intensity: str | None = None
     """Column of intensities; None in tables of generation."""
     unit: str = ""
-    """Unit of the intensities, as of ``exogenous.columns``; empty is g/kWh."""
+    """Unit of the intensities, in the syntax of ``exogenous.columns``; empty for g/kWh."""
     expected: str = ""
-    """Columns of a table of intensities, for messages."""
+    """Description of the columns of a table of intensities, for messages."""
     note: str = ""
-    """What a user should know of the intensities."""
+    """Remark on the intensities for the user."""
     area: str | None = None
-    """Column of the area; None if a table holds one area."""
+    """Column of the area; None if a table covers one area."""
     generation: tuple[str, ...] = ()
-    """Columns of generation, whose first group is the name of the type; the first pattern that
-    fits any column is used."""
+    """Patterns of columns of generation; the first group is the name of the type. The first pattern
+    that matches any column is used."""
     type: str | None = None
     """Column of the type, in tables with a row for each type."""
     value: str | None = None
     """Column of the generation, in tables with a row for each type."""
     missing: tuple[str, ...] = ()
-    """Cells that stand for no value."""
+    """Cells that represent a missing value."""
 
 
 class Service(_Record):
@@ -78,31 +78,31 @@ class Service(_Record):
     name: str
     """Name in file names and commands, such as ``eia-930``."""
     title: str
-    """Name for people, with the publisher."""
+    """Title with the publisher, for messages and notes."""
     licence: str
-    """Licence of the data, or what is known of it."""
+    """Licence of the data, as far as it is known."""
     page: str
-    """Address of the page for people, where data can be had by hand or a key is asked for."""
+    """Web page from which users get data by hand or apply for a key."""
     address: str = ""
-    """Address that requests go to; empty if none do."""
+    """Address for requests; empty if there are none."""
     key: KeySource | None = None
-    """Key that the service asks for; None if it asks for none."""
+    """Key that the service needs; None if it needs none."""
     first_year: int | None = None
-    """First whole calendar year of the data."""
+    """First complete calendar year of the data."""
     stamp: Stamp = "auto"
-    """What its stamps mark."""
+    """Moment of an interval that the service's stamps mark."""
     by_hand: str = ""
-    """How a user gets the data where the service cannot be reached."""
+    """Instructions for getting the data by hand if the service cannot be reached."""
     types: dict[str, GenerationType] = {}
-    """Kinds of generation by code."""
+    """Types of generation by code."""
     zones: dict[str, str] = {}
     """Codes of areas by name."""
     saved_table: SavedTable | None = None
-    """Layout of tables saved by hand; None if none are read."""
+    """Layout of tables saved by users; None if the service has no such tables."""
 
 
 @cache
 def services() -> dict[str, Service]:
-    """Services by name."""
+    """Return the services by name."""
     content = files(__package__).joinpath("services.yaml").read_text("utf-8")
     return {name: Service(name=name, **values) for name, values in yaml.safe_load(content).items()}

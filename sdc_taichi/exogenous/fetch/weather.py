@@ -1,9 +1,9 @@
-"""Weather from the web: typical years of PVGIS, and EPW files by address.
+"""Weather from the web: typical years of PVGIS, and EPW files from an address.
 
-A typical year joins twelve months of reanalysed weather (ISO 15927-4) at a place given by latitude
-and longitude. Its rows are stamped in UTC at full hours; each is taken for the hour that begins
-then and is moved to local standard time, where the last hours of the year become the first, or the
-other way round.
+A typical year joins twelve months of reanalysed weather (ISO 15927-4) for a latitude and
+longitude. Its rows have UTC stamps at full hours. Each row counts for the hour that begins at its
+stamp and is moved to local standard time, with the year closed to a circle: hours that cross its
+end continue at its start.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from sdc_taichi.exogenous.weather_table import Place
 from sdc_taichi.user_file import decoding
 
 MOST_OFFSET_ERROR_H = 4.0
-"""Largest difference, in h, between local standard time and the time of the sun: about 3.2 h in the
-west of China is the largest in use, and a wrong sign is mostly beyond."""
+"""Largest valid difference between local standard time and solar time, in h. The largest one in
+use is about 3.2 h, in the west of China; a wrong sign of the offset usually exceeds the limit."""
 _MOST_DISTANCE_DEG = 0.01
 _COLUMNS = {"T2m": "dry_bulb", "RH": "relative_humidity", "SP": "pressure"}
-"""Columns of PVGIS, and those of a weather table, in the same units."""
+"""Columns of a weather table by the names of PVGIS, in the same units."""
 _COMMON_YEAR = np.datetime64("2001-01-01T00", "h") + np.arange(8760)
 """Stamps of the hours of a year without 29 February, for the rows of a typical year."""
 _ARCHIVE = b"PK\x03\x04"
 
 
 def request_year(latitude_deg: float, longitude_deg: float) -> Request:
-    """Request of the typical year of a place.
+    """Build the request for the typical year of a location.
 
     Args:
         latitude_deg: latitude, in degrees north.
         longitude_deg: longitude, in degrees east.
 
     Raises:
-        DataError: no place on Earth.
+        DataError: the coordinates are out of range.
     """
     place = {"latitude": latitude_deg, "longitude": longitude_deg}
     for (name, value), most in zip(place.items(), (90.0, 180.0), strict=True):
@@ -71,9 +71,9 @@ def request_year(latitude_deg: float, longitude_deg: float) -> Request:
 
 
 def typical_year(content: bytes, url: str, utc_offset_h: float) -> tuple[bytes, Place]:
-    """Weather table of a typical year in local standard time, and its place.
+    """Convert a typical year to a weather table in local standard time; return it with its place.
 
-    An offset with a half hour takes the mean of two rows.
+    For an offset with a half hour, each value is the mean of two rows.
 
     Args:
         content: answer of PVGIS.
@@ -81,7 +81,7 @@ def typical_year(content: bytes, url: str, utc_offset_h: float) -> tuple[bytes, 
         utc_offset_h: local standard time minus UTC, in h.
 
     Raises:
-        DataError: no typical year, or an offset that does not fit the longitude.
+        DataError: the answer is not a typical year, or the offset does not fit the longitude.
     """
     place, table = _read(content, url)
     check_offset(utc_offset_h, place["longitude"])
@@ -100,10 +100,10 @@ def typical_year(content: bytes, url: str, utc_offset_h: float) -> tuple[bytes, 
 
 
 def check_offset(utc_offset_h: float, longitude_deg: float) -> None:
-    """Check that a UTC offset can be that of a longitude.
+    """Check that a UTC offset is possible at a longitude.
 
     Raises:
-        DataError: out of range, or further from the time of the sun than any in use.
+        DataError: the offset is out of range, or too far from solar time.
     """
     off_h = (utc_offset_h - longitude_deg / 15.0 + 12.0) % 24.0 - 12.0
     if not -12.0 <= utc_offset_h <= 14.0 or abs(off_h) > MOST_OFFSET_ERROR_H:
@@ -114,7 +114,7 @@ def check_offset(utc_offset_h: float, longitude_deg: float) -> None:
 
 
 def _read(content: bytes, url: str) -> tuple[dict[str, float], Any]:
-    """Latitude, longitude (degrees) and elevation (m) of an answer, and its rows in UTC."""
+    """Parse an answer: latitude, longitude (degrees) and elevation (m), and rows in UTC."""
     import pandas as pd
 
     with decoding(url, "JSON", DataError):
@@ -132,7 +132,7 @@ def _read(content: bytes, url: str) -> tuple[dict[str, float], Any]:
         ) from None
     if len(table) != _COMMON_YEAR.size:
         raise DataError(f"{url}: {len(table)} rows in tmy_hourly, expected {_COMMON_YEAR.size}")
-    # Stamps of databases of satellites carry minutes, which concern irradiance alone.
+    # Stamps of satellite databases have minutes, which concern only irradiance.
     expected = [f"{stamp:%m%d:%H}" for stamp in _COMMON_YEAR.tolist()]
     wrong = (stamps.str[4:11] != expected).to_numpy()
     if wrong.any():
@@ -152,37 +152,36 @@ def _read(content: bytes, url: str) -> tuple[dict[str, float], Any]:
 
 
 def request_epw(url: str) -> Request:
-    """Request of a weather file.
+    """Build the request for a weather file.
 
     Args:
-        url: address of an EPW file or of a ZIP archive with one, as those of
-            climate.onebuilding.org.
+        url: address of an EPW file, or of a ZIP archive with one, as at climate.onebuilding.org.
 
     Raises:
-        DataError: no address of the web, or one with a password.
+        DataError: the text is not a web address, or it contains a password.
     """
     try:
         parts = urlsplit(url)
     except ValueError:
         parts = urlsplit("")
-    # HTTP libraries differ in whether they ask for a host whose name holds a space.
+    # HTTP libraries differ on host names with a space, so refuse them here.
     if parts.scheme not in ("http", "https") or not parts.hostname or " " in parts.netloc:
         raise DataError(f"{shortened(url)}: expected an address that begins with https://")
     if parts.username is not None or parts.password is not None:
         raise DataError(f"{parts.hostname}: an address with a password, expected one without")
     name = unquote(parts.path.rsplit("/", 1)[-1])
     name = re.sub(r"[^A-Za-z0-9._-]", "-", name).strip(".-")[-100:] or "weather"
-    # Equal names of different addresses are different files.
+    # Different addresses may end in equal file names, so add a hash of the address.
     name = f"{hashlib.sha256(url.encode()).hexdigest()[:8]}_{name}"
     by_hand = "save it with a browser, then data import FILE --site NAME"
     return Request(services()["epw"], url, name, by_hand=by_hand, check=epw_bytes)
 
 
 def epw_bytes(content: bytes, url: str) -> bytes:
-    """The EPW file of an answer, taken from its archive if it lies in one.
+    """Return the EPW file in an answer, unpacked if the answer is an archive.
 
     Raises:
-        DataError: no EPW file, an archive with none or with several, or one that is too large or
+        DataError: there is no EPW file, or the archive has none or several, is too large or is
             damaged.
     """
     if content.startswith(_ARCHIVE):
