@@ -1,5 +1,6 @@
-"""Equations of devices, from servers and CRAC units to the battery, as pure functions over arrays.
+"""Equations of devices, from servers and CRAC units to the battery, as pure functions of arrays.
 
-A function here takes arrays whose first axis is the data center and returns arrays of that shape.
-It holds no state, reads no configuration, and branches on no value, so that it also runs compiled.
+Each function takes and returns arrays of shape (B,), with B data centers along the first axis.
+It holds no state, reads no configuration, and has no branch that depends on an array's values, so
+a compiler can translate it unchanged.
 """

@@ -1,8 +1,8 @@
 """Density of dry air, as an ideal gas.
 
-In halls, airflows are volume flows of air at REFERENCE_C and the pressure of the site: flows add up
-where streams of unlike temperature mix, since each stands for a mass. What passes a fan is the
-volume at its own temperature.
+Airflows in halls are volume flows of air at REFERENCE_C and the pressure of the site. They are
+therefore proportional to mass flows and add up where streams of different temperature mix. A fan
+moves the volume that this air has at its actual temperature.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ GAS_CONSTANT_J_PER_KG_K = 287.05
 ZERO_C_K = 273.15
 """Temperature of 0 C, in K."""
 REFERENCE_C = 20.0
-"""Temperature at which airflows are given as volumes, in C: that of the standard air of fans."""
+"""Reference temperature of volume flows, in C; fan ratings use standard air of this temperature."""
 EXACT_AT_C = (18.0, 32.0)
-"""Temperatures at which the straight line of ``OF_IDEAL_GAS`` is exact, in C."""
+"""Two temperatures, in C, at which the linear ``OF_IDEAL_GAS`` equals the ideal gas law."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class DensityRatio:
     """Fall of the ratio with temperature, in 1/K."""
 
     def at(self, temperature_c: F64) -> F64:
-        """Ratio at temperatures in C, of any shape, dimensionless."""
+        """Return the density ratio, dimensionless, at temperatures in C of any shape."""
         return self.base - self.fall_per_k * temperature_c
 
 
@@ -43,12 +43,12 @@ def _line() -> DensityRatio:
 
 
 OF_IDEAL_GAS = _line()
-"""The density of an ideal gas falls as 1/T; the line errs by at most 0.06 % within 15..35 C, 0.2 %
-at 10 C and 0.4 % at 45 C."""
+"""Linear fit to the density of an ideal gas, which falls as 1/T. Its error is at most 0.06 % within
+15..35 C, 0.2 % at 10 C and 0.4 % at 45 C."""
 CONSTANT = DensityRatio(1.0, 0.0)
-"""Ratio of an air whose density does not depend on its temperature."""
+"""Density ratio of air whose density does not depend on temperature: 1 everywhere."""
 
 
 def density_kg_m3(pressure_pa: float, temperature_c: float) -> float:
-    """Density of dry air, in kg/m3, from its pressure in Pa and temperature in C: p/(R T)."""
+    """Return the density p/(R T) of dry air, in kg/m3, from its pressure and temperature."""
     return pressure_pa / (GAS_CONSTANT_J_PER_KG_K * (temperature_c + ZERO_C_K))

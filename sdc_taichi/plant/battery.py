@@ -1,11 +1,12 @@
 """Batteries: energy stored, drawn and delivered in one step, by the models in ``BATTERIES``.
 
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. Energy at the bus:
-charge_kwh is drawn, discharge_kwh delivered, and
+Arguments are float64 arrays of shape (B,), B data centers, or anything that broadcasts to it.
+charge_kwh is the energy drawn from the electric bus and discharge_kwh the energy delivered to it.
+Up to rounding errors, the stored energy after a step is
 
     stored' = stored + charge_efficiency*charge_kwh - discharge_factor*discharge_kwh
 
-to rounding; the released model has no losses and rounds its store to 8 decimals of a MWh.
+The model ``released`` has no losses and rounds the stored energy to 8 decimals of a MWh.
 
 Every battery protects the grid connection, whatever the command is: it charges only with the power
 that the limit leaves beside the load, and where the load alone exceeds the limit it discharges to
@@ -26,63 +27,67 @@ import numpy as np
 from sdc_taichi.types import BatteryResult, Values
 
 _ROUND_OFF_SHARE = 1e-12
-"""Share of the stored energy that rounding may leave in a battery that is emptied exactly."""
+"""Largest rounding error of the stored energy, as a share of it; a smaller rest counts as empty."""
 
 
 class BatteryParameters(NamedTuple):
-    """Parameters of a battery, by the names of their fields in section ``battery``."""
+    """Parameters of a battery, named like the fields of the configuration section ``battery``."""
 
     charge_efficiency: Values = 0.97
-    """Energy stored per energy drawn, 0..1, (B,)."""
+    """Energy stored divided by energy drawn from the bus, 0..1, (B,)."""
     discharge_factor: Values = 1.04
-    """Energy taken from the store per energy delivered, 1 or more, (B,)."""
+    """Energy taken from the store divided by energy delivered to the bus, 1 or more, (B,)."""
     charge_limit_c_rate: Values = 3.0
-    """Largest rate into the store, in capacities per hour, (B,)."""
+    """Largest rate at which the stored energy rises, in capacities per hour, (B,)."""
     discharge_limit_c_rate: Values = 3.0
-    """Largest rate out of the store, in capacities per hour, (B,)."""
+    """Largest rate at which the stored energy falls, in capacities per hour, (B,)."""
     upper_u_h: Values = -0.04
-    """Rise of the highest stored energy with the charge power, in h, at most 0, (B,)."""
+    """Slope of the highest stored energy against the charge power, in h, at most 0, (B,)."""
     upper_v: Values = 1.0
-    """Highest stored energy without charge power, as a share of the capacity, (B,)."""
+    """Highest stored energy at zero charge power, as a share of the capacity, (B,)."""
     lower_u_h: Values = 0.01
-    """Rise of the lowest stored energy with the discharge power, in h, at least 0, (B,)."""
+    """Slope of the lowest stored energy against the discharge power, in h, at least 0, (B,)."""
     lower_v: Values = 0.0
-    """Lowest stored energy without discharge power, as a share of the capacity, (B,)."""
+    """Lowest stored energy at zero discharge power, as a share of the capacity, (B,)."""
 
 
 class BatteryPoint(NamedTuple):
-    """Size of batteries and load of their facilities in one step."""
+    """Battery sizes and facility loads of B data centers in one step."""
 
     capacity_kwh: Values
-    """Capacity, in kWh, (B,); 0 means no battery."""
+    """Battery capacity, in kWh, (B,); 0 means no battery."""
     load_kw: Values
-    """Facility load, in kW, (B,); a discharge never delivers more."""
+    """Facility load, in kW, (B,); the battery never delivers more power than this."""
     dt_h: Values
     """Length of the step, in h."""
     parameters: BatteryParameters = BatteryParameters()
-    """Parameters that the configuration gives."""
+    """Battery parameters from the configuration."""
     grid_limit_kw: Values | None = None
-    """Largest power of the grid connection, in kW, (B,); None is no limit."""
+    """Largest power of the grid connection, in kW, (B,); None means that no limit applies."""
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryModel:
-    """A battery model."""
+    """Battery model: its step function and the meaning of its discharge limit."""
 
     step: Callable[[Values, Values, BatteryPoint], BatteryResult]
-    """One step from the stored energy, in kWh, (B,), and the command, the share of the limit power
-    at which the battery charges (up to 1) or discharges (down to -1), (B,)."""
+    """Function that computes one step from the stored energy, in kWh, (B,), the command, (B,), and
+    a ``BatteryPoint``. The command is the share of the limit power at which the battery charges
+    (0..1) or discharges (-1..0)."""
     by_rate_of_store: bool = False
-    """Whether ``discharge_limit_c_rate`` limits the rate out of the store, which exceeds the rate
-    delivered by the losses."""
+    """True if ``discharge_limit_c_rate`` limits the power taken from the store, losses included;
+    False if it limits the power delivered to the bus."""
 
 
 def clc(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
-    """C/L/C: constant efficiencies, linear limits of the stored energy, constant rate limits.
+    """Step the C/L/C model: constant efficiencies, linear energy limits, constant rate limits.
+
+    The charge power P_c and the discharge power P_d obey, for the stored energy b,
 
     P_c <= min(alpha_c*C/eta_c, (v*C - b)/(eta_c*dt - u)),
-    P_d <= min(alpha_d*C/eta_d, (b - v'*C)/(u' + eta_d*dt), load), with the true step length, so
-    the limits of the stored energy hold at the end of the step.
+    P_d <= min(alpha_d*C/eta_d, (b - v'*C)/(u' + eta_d*dt), load).
+
+    Since dt is the true step length, the energy limits hold at the end of the step.
     """
     capacity_kwh, dt_h, battery = point.capacity_kwh, point.dt_h, point.parameters
     efficiency, factor = battery.charge_efficiency, battery.discharge_factor
@@ -104,14 +109,15 @@ def clc(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResu
 
 
 def released(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
-    """The battery of the released SustainDC code, as identified from its recorded runs.
+    """Step the battery of the released SustainDC code, as identified from its recorded runs.
 
-    The limits use a step length T that depends on the state of charge s instead of dt: charging
-    T = dt*round(sigmoid(5 - 10*s)/2, 4) and energy min(0.1*C, (C - b)/(T + 0.04))*T; discharging
-    T = dt*max(4*sigmoid(10*(s - 0.25)), 0.5) and energy min(C, b/(T + 0.01), load/4)*T. The
-    quarter comes from passing the energy of a quarter hour where a power belongs, so even a full
-    battery carries less than the load. The code was only used with dt = 0.25 h. No losses but what
-    the rounding takes or gives, 5e-6 kWh at most: the store is in MWh with 8 decimals.
+    Its limits replace dt by a time T that depends on the state of charge s. For charging,
+    T = dt*round(sigmoid(5 - 10*s)/2, 4) and the energy is min(0.1*C, (C - b)/(T + 0.04))*T. For
+    discharging, T = dt*max(4*sigmoid(10*(s - 0.25)), 0.5) and the energy is
+    min(C, b/(T + 0.01), load/4)*T. The factor 1/4 arises because the code passes the energy of a
+    quarter hour where a power belongs; therefore even a full battery cannot cover the load. The
+    code was only used with dt = 0.25 h. The model has no losses, but it rounds the stored energy
+    to 8 decimals of a MWh, which changes it by at most 5e-6 kWh.
     """
     capacity_kwh, dt_h = point.capacity_kwh, point.dt_h
     exists = np.greater(capacity_kwh, 0.0)
@@ -137,12 +143,13 @@ def released(stored_kwh: Values, command: Values, point: BatteryPoint) -> Batter
 
 
 def paper(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
-    """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
+    """Step the battery of the paper (appendix A.3.4): energy limits and a largest power.
 
     r_charge = min((C - E)/(eta_c*dt), P_max), r_discharge = min(E/(eta_d*dt), P_max, load). The
-    paper puts P_max in terms of the rate it limits (P_charge,max = u*P_charge + v), so it is taken
-    as a share of the capacity. It writes E for both the state and the flow; the latter is read as
-    the change of the state, +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
+    paper defines P_max by the very rate that it limits (P_charge,max = u*P_charge + v), so this
+    model uses a constant share of the capacity instead. The paper writes E for both the stored
+    energy and its flow; this model takes the flow as the change of the stored energy,
+    +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
     """
     capacity_kwh, dt_h, battery = point.capacity_kwh, point.dt_h, point.parameters
     return _step(
@@ -165,7 +172,7 @@ BATTERIES: dict[str, BatteryModel] = {
     "released": BatteryModel(released),
     "paper": BatteryModel(paper),
 }
-"""Battery models by the names that ``battery.model`` takes."""
+"""Battery models by their names, the valid values of ``battery.model``."""
 
 
 def _step(
@@ -176,7 +183,7 @@ def _step(
     charge_limit_kw: Values,
     discharge_limit_kw: Values,
 ) -> BatteryResult:
-    """Charge or discharge at a share of the limit powers; a discharge never exceeds the load."""
+    """Charge or discharge at ``command`` times the limit power, and at most at the load."""
     discharge_kw = np.minimum(discharge_limit_kw, point.load_kw)
     charge_kwh, discharge_kwh = _within_grid_limit(
         np.maximum(command, 0.0) * charge_limit_kw * point.dt_h,
@@ -190,23 +197,23 @@ def _step(
         + battery.charge_efficiency * charge_kwh
         - battery.discharge_factor * discharge_kwh
     )
-    # Emptying or filling exactly can miss by the last bits, and an empty battery carries nothing.
+    # Rounding errors must neither leave energy in an emptied battery nor overfill a full one.
     after_kwh = np.where(after_kwh > _ROUND_OFF_SHARE * stored_kwh, after_kwh, 0.0)
     after_kwh = np.minimum(after_kwh, point.capacity_kwh)
     return _battery(stored_kwh, after_kwh, charge_kwh, discharge_kwh, point)
 
 
 def _within_grid_limit(
-    charge_kwh: Values, discharge_kwh: Values, most_discharge_kwh: Values, point: BatteryPoint
+    charge_kwh: Values, discharge_kwh: Values, max_discharge_kwh: Values, point: BatteryPoint
 ) -> tuple[Values, Values]:
-    """Charge and discharge, kWh, that keep the grid connection within its limit where possible."""
+    """Adjust charge and discharge, in kWh, so that the grid limit holds where possible."""
     if point.grid_limit_kw is None:
         return charge_kwh, discharge_kwh
     load_kwh, limit_kwh = point.load_kw * point.dt_h, point.grid_limit_kw * point.dt_h
     missing_kwh = np.maximum(load_kwh - limit_kwh, 0.0)
     return (
         np.minimum(charge_kwh, np.maximum(limit_kwh - load_kwh, 0.0)),
-        np.maximum(discharge_kwh, np.minimum(missing_kwh, most_discharge_kwh)),
+        np.maximum(discharge_kwh, np.minimum(missing_kwh, max_discharge_kwh)),
     )
 
 
@@ -217,7 +224,7 @@ def _battery(
     discharge_kwh: Values,
     point: BatteryPoint,
 ) -> BatteryResult:
-    """Result of a step, with loss and grid energy from the energies before and after it."""
+    """Build the result of a step: losses and grid energy follow from the stored energies."""
     return BatteryResult(
         *np.broadcast_arrays(
             after_kwh,
@@ -230,5 +237,5 @@ def _battery(
 
 
 def _sigmoid(x: Values) -> Values:
-    """Logistic function 1/(1 + exp(-x))."""
+    """Return the logistic function 1/(1 + exp(-x))."""
     return 1.0 / (1.0 + np.exp(-x))

@@ -1,13 +1,13 @@
 """Chillers: electric power for a cooling load, one record per model in ``CHILLERS``.
 
-A record has the equations of a model and all other facts about it: whether its condenser is cooled
-by tower water or by outdoor air, its reference COP, and the temperatures within which its curves
-are valid. The names that ``hvac.chiller.model`` accepts, the plant of a chiller, its sizing and the
-table in the documentation are derived from the records.
+A record holds the equations of a model, the medium that cools its condenser (tower water or outdoor
+air), its reference COP, and the temperatures within which its curves are valid. The valid values of
+``hvac.chiller.model``, the plant of a chiller, its sizing and the table in the documentation are
+derived from the records.
 
-The equations take the load and a ``ChillerPoint`` of float64 arrays (B,), or anything that
-broadcasts to that shape, and read what they need. A load below zero counts as none. Temperatures
-beyond the bounds of a record are evaluated at the nearest bound.
+The equations take the load and a ``ChillerPoint`` of float64 arrays (B,), B data centers, or
+anything that broadcasts to that shape. A negative load counts as zero. Temperatures beyond the
+bounds of a record are replaced by the nearest bound.
 
 Sources: EnergyPlus Engineering Reference, "Chillers" (Chiller:Electric, Chiller:Electric:EIR,
 Chiller:ConstantCOP); York and Trane data sets as in Modelica Buildings,
@@ -25,9 +25,9 @@ import numpy as np
 from sdc_taichi.types import F64, Values
 
 KELVIN = 273.15
-"""0 C in kelvin."""
+"""Temperature of 0 C, in K."""
 BOILING_C = 100.0
-"""Warmest chilled water of models without bounds, in C."""
+"""Highest chilled-water temperature for models without bounds, in C."""
 
 # York YT 1055 kW / 5.96 COP, inlet vanes: biquadratics in (1, Te, Te^2, Tc, Tc^2, Te*Tc), C.
 YORK_CAPACITY = (
@@ -41,39 +41,41 @@ YORK_CAPACITY = (
 YORK_EIR = (5.245110e-01, -2.850126e-02, 8.034720e-04, 1.893133e-02, 1.151629e-04, -9.340642e-05)
 YORK_PART_LOAD = (2.619878e-01, 2.393605e-01, 4.988306e-01)
 
-# Trane CVHE 1442 kW / 6.61 COP with variable speed: part-load curve, and the lift at which its
-# full-load energy input ratio would be 0 if it stayed a straight line.
+# Part-load curve of the Trane CVHE 1442 kW / 6.61 COP with variable speed. Its energy input ratio
+# at full load is nearly linear in the lift and would reach 0 at the negative of the lift offset.
 VSD_PART_LOAD = (9.299787e-02, 3.244475e-01, 5.818753e-01)
 VSD_LIFT_OFFSET_K = 22.0
-"""Lift that ``centrifugal_vsd`` adds to that between the waters, in K.
+"""Lift that ``centrifugal_vsd`` adds to condenser minus chilled-water temperature, in K.
 
-Fitted to the full-load map of the Trane data set, 4.44..8.89 C chilled and 12.78..35 C condenser
-water: 0.9 % root mean square, at most 3 %. It stands for the temperature differences in evaporator
-and condenser, and for the efficiency that the compressor loses at low lift.
+The value is fitted to the full-load map of the Trane data set (4.44..8.89 C chilled water,
+12.78..35 C condenser water), with a root-mean-square error of 0.9 % and a largest error of 3 %. It
+represents the temperature differences inside evaporator and condenser, and the efficiency that the
+compressor loses at low lift.
 """
 
 YORK_CHILLED_WATER_C = 6.67
-"""Leaving chilled water at the reference point of the York data set, in C."""
+"""Leaving chilled-water temperature at the reference point of the York data set, in C."""
 YORK_CONDENSER_C = 29.44
-"""Entering condenser water at the reference point of the York data set, in C."""
+"""Entering condenser-water temperature at the reference point of the York data set, in C."""
 
 YORK_COP = 5.96
-"""COP at the reference point of the York machine, and of the Trane machine, in W/W."""
+"""COP of the York chiller at its reference point, also used for the Trane chiller, in W/W."""
 MIN_LIFT_K = 6.11
 """Smallest lift of ``carnot`` and ``centrifugal_vsd`` by default, in K.
 
-The York data set admits condenser water down to 12.78 C against chilled water at 6.67 C: below that
-difference a centrifugal compressor has no head to work against, and the flow through the expansion
-device, not the lift, limits it. Without a floor a constant Carnot effectiveness diverges as the two
-temperatures meet.
+The York data set allows condenser water down to 12.78 C with chilled water at 6.67 C, a difference
+of 6.11 K. At smaller differences the flow through the expansion device, not the lift, limits a
+centrifugal compressor. Without a smallest lift, the COP of a constant Carnot effectiveness would
+diverge as the two temperatures become equal.
 """
 
 MIN_DELTA_K = -15.0
-"""Smallest temperature difference of Chiller:Electric, in K: its capacity parabola turns over near
-it, and colder condenser water would start to cost capacity."""
+"""Smallest temperature difference at which Chiller:Electric is evaluated, in K. Its capacity is a
+parabola with a maximum near this value; below it, colder condenser water would reduce capacity."""
 
 ELECTRIC_PART_LOAD = (0.03303, 0.6852, 0.2818)
-"""Power over full-load power of Chiller:Electric, a quadratic in the part-load ratio."""
+"""Coefficients of power divided by full-load power of Chiller:Electric, in powers 0, 1 and 2 of the
+part-load ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,89 +87,91 @@ class ChillerResult:
     evaporator_w: F64
     """Heat taken from the chilled water, in W, (B,); the load is evaporator_w + unmet_w."""
     available_w: F64
-    """Cooling capacity under the present temperatures, in W, (B,)."""
+    """Cooling capacity at the temperatures of the step, in W, (B,)."""
     unmet_w: F64
-    """Load beyond the available capacity, in W, (B,)."""
+    """Part of the load above the available capacity, in W, (B,)."""
     plr: F64
-    """Part-load ratio evaporator_w / available_w, 0..1, (B,); the mean over on and off when the
-    machine cycles."""
+    """Part-load ratio evaporator_w / available_w, 0..1, (B,); for a chiller that cycles, the mean
+    over its on and off times."""
     cop: F64
-    """Coefficient of performance evaporator_w / power_w, in W/W, (B,); 0 when the machine is
+    """Coefficient of performance evaporator_w / power_w, in W/W, (B,); 0 when the chiller is
     off."""
     rejected_w: F64
-    """Heat that the model hands to the cooling tower, in W, (B,)."""
+    """Heat that the model passes to the cooling tower, in W, (B,)."""
 
 
 class ChillerParameters(NamedTuple):
-    """Parameters of a machine, by the names of their fields in section ``hvac.chiller``."""
+    """Parameters of a chiller, named like the fields of the section ``hvac.chiller``."""
 
     reference_cop: Values
     """Coefficient of performance at the reference point of the model, in W/W, (B,)."""
     min_lift_k: Values = MIN_LIFT_K
-    """Smallest lift, entering condenser water less leaving chilled water, in K, (B,)."""
+    """Smallest lift (entering condenser water minus leaving chilled water), in K, (B,)."""
 
 
 class ChillerPoint(NamedTuple):
-    """Size and temperatures at which chillers work."""
+    """Chiller size, temperatures and parameters in one step."""
 
     reference_w: Values
     """Cooling capacity at the reference point of the model, in W, (B,)."""
     chilled_water_c: Values
-    """Leaving chilled water, in C, (B,)."""
+    """Leaving chilled-water temperature, in C, (B,)."""
     condenser_c: Values
-    """Entering condenser water, in C, (B,)."""
+    """Entering condenser-water temperature, in C, (B,)."""
     outdoor_c: Values
-    """Outdoor dry bulb, in C, (B,)."""
+    """Outdoor dry-bulb temperature, in C, (B,)."""
     machine: ChillerParameters
-    """Parameters that the configuration gives."""
+    """Chiller parameters from the configuration."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChillerModel:
-    """A chiller model: its equations, and the facts that plants and sizing need."""
+    """Chiller model: its equations and the properties that plants and sizing need."""
 
     equations: Callable[[Values, ChillerPoint], ChillerResult]
-    """Power and heat for a cooling load in W, (B,), at a point within the bounds below."""
+    """Function from a cooling load in W, (B,), and a point within the bounds to power and heat."""
     tower_water: bool = True
-    """Whether the condenser can be cooled by the water of a cooling tower."""
+    """True if the water of a cooling tower can cool the condenser."""
     outdoor_air: bool = False
-    """Whether the condenser can be cooled by outdoor air."""
+    """True if outdoor air can cool the condenser."""
     reference_cop: float = YORK_COP
-    """COP at the reference point of the machine, in W/W, where the configuration gives none."""
+    """Default COP at the reference point, in W/W, used if the configuration sets none."""
     chilled_water_bounds_c: tuple[float, float] | None = None
-    """Leaving chilled water within which the curves hold, in C; None is any. A plant makes no
-    chilled water beyond them: colder water is an error of the configuration, and for warmer supply
-    air the water stays at the warmest."""
+    """Lowest and highest leaving chilled-water temperature for which the curves are valid, in C;
+    None allows any value. A configuration that needs colder water is an error. If the supply air
+    would allow warmer water, the plant makes water at the upper bound."""
     condenser_bounds_c: tuple[float, float] | None = None
-    """Entering condenser water within which the curves hold, in C; None is any."""
+    """Lowest and highest entering condenser-water temperature for which the curves are valid, in C;
+    None allows any value."""
 
     @property
     def warmest_water_c(self) -> float:
-        """Warmest chilled water that a plant with this chiller makes, in C."""
+        """Highest chilled-water temperature of a plant with this chiller, in C."""
         return BOILING_C if self.chilled_water_bounds_c is None else self.chilled_water_bounds_c[1]
 
     def step(self, load_w: Values, point: ChillerPoint) -> ChillerResult:
-        """One step of the chillers of B data centers.
+        """Compute one step of the chillers of B data centers.
 
         Args:
             load_w: Cooling load, W, (B,).
-            point: Size and temperatures.
+            point: Chiller sizes, temperatures and parameters.
         """
         if self.chilled_water_bounds_c is not None:
-            held_c = np.clip(point.chilled_water_c, *self.chilled_water_bounds_c)
-            point = point._replace(chilled_water_c=held_c)
+            bounded_c = np.clip(point.chilled_water_c, *self.chilled_water_bounds_c)
+            point = point._replace(chilled_water_c=bounded_c)
         if self.condenser_bounds_c is not None:
-            held_c = np.clip(point.condenser_c, *self.condenser_bounds_c)
-            point = point._replace(condenser_c=held_c)
+            bounded_c = np.clip(point.condenser_c, *self.condenser_bounds_c)
+            point = point._replace(condenser_c=bounded_c)
         return self.equations(load_w, point)
 
 
 def centrifugal_vsd(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Water-cooled centrifugal chiller with variable speed, fitted to a Trane CVHE of 1442 kW.
+    """Step a water-cooled, variable-speed centrifugal chiller, fitted to a 1442 kW Trane CVHE.
 
-    COP = c * Te / (max(Tc - Te, min_lift_k) + 22 K) in kelvin, with c such that the COP is
-    `reference_cop` at 6.67 C chilled and 29.44 C condenser water and full load (the data set has
-    5.97 there); capacity does not depend on temperature. The part-load curve of the data set is
+    COP = c * Te / (max(Tc - Te, min_lift_k) + 22 K), with the temperatures of leaving chilled water
+    Te and entering condenser water Tc in kelvin. The constant c is chosen so that the COP is
+    `reference_cop` at 6.67 C chilled water, 29.44 C condenser water and full load (5.97 in the
+    data set). Capacity does not depend on temperature. The part-load curve of the data set is
     divided by its value at full load (0.9993).
     """
     evaporator_k = point.chilled_water_c + KELVIN
@@ -187,11 +191,12 @@ def centrifugal_vsd(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def carnot(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Constant Carnot effectiveness with the part-load curve of the York machine.
+    """Step a chiller of constant Carnot effectiveness with the part-load curve of the York chiller.
 
-    COP = eta * Te / max(Tc - Te, min_lift_k) in kelvin, with eta such that the COP is
-    `reference_cop` at 6.67 C chilled and 29.44 C condenser water and full load; capacity does not
-    depend on temperature. The part-load curve is divided by its value at full load (1.0002).
+    COP = eta * Te / max(Tc - Te, min_lift_k), with the temperatures of leaving chilled water Te and
+    entering condenser water Tc in kelvin. The effectiveness eta is chosen so that the COP is
+    `reference_cop` at 6.67 C chilled water, 29.44 C condenser water and full load. Capacity does
+    not depend on temperature. The part-load curve is divided by its value at full load (1.0002).
     """
     evaporator_k = point.chilled_water_c + KELVIN
     lift_k = np.maximum(point.condenser_c + KELVIN - evaporator_k, point.machine.min_lift_k)
@@ -207,9 +212,10 @@ def carnot(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """York YT centrifugal chiller by its Chiller:Electric:EIR curves.
+    """Step a York YT centrifugal chiller with its Chiller:Electric:EIR curves.
 
-    Q_avail = Q_ref*CapFT, P = Q_avail/COP_ref*EIRFT*EIRFPLR*min(1, PLR/min_plr)
+    The available capacity is Q_avail = Q_ref*CapFT and the power is
+    P = Q_avail/COP_ref*EIRFT*EIRFPLR*min(1, PLR/min_plr)
     (EnergyPlus Engineering Reference, Chiller:Electric:EIR).
     """
     evaporator_c, entering_c = point.chilled_water_c, point.condenser_c
@@ -223,9 +229,10 @@ def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
+    """Step a water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
 
-    Coefficients of the EnergyPlus unit test ChillerElectric; its nominal COP is 4.75.
+    The coefficients are those of the EnergyPlus unit test ChillerElectric, whose nominal COP is
+    4.75.
     """
     delta_k = (point.condenser_c - 29.44) / 2.682759 - (point.chilled_water_c - 6.667)
     return _electric(
@@ -240,9 +247,9 @@ def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def electric_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Air-cooled Chiller:Electric: the condenser sees the outdoor dry bulb.
+    """Step an air-cooled Chiller:Electric, whose condenser takes air at the outdoor dry bulb.
 
-    Coefficients of the EnergyPlus test file AirCooledElectricChiller.idf.
+    The coefficients are those of the EnergyPlus test file AirCooledElectricChiller.idf.
     """
     delta_k = (point.outdoor_c - 35.0) / 2.778 - (point.chilled_water_c - 6.67)
     return _electric(
@@ -257,7 +264,7 @@ def electric_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def constant_cop(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Constant COP up to the capacity (EnergyPlus Engineering Reference, Chiller:ConstantCOP)."""
+    """Step a chiller whose COP is constant up to its capacity (EnergyPlus Chiller:ConstantCOP)."""
     load = np.maximum(load_w, 0.0)
     evaporator_w = np.minimum(load, point.reference_w)
     power_w = evaporator_w / point.machine.reference_cop
@@ -267,12 +274,13 @@ def constant_cop(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def released(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """The chiller of the released SustainDC code: Chiller:Electric with three departures.
+    """Step the chiller of the released SustainDC code: Chiller:Electric with three departures.
 
-    The difference from design is (T_amb - 35)/2.778 - (6.67 - 35), so the chilled water never
-    enters and 28.33 K too much does; the last capacity coefficient is positive; the cooling load,
-    not the heat rejected by the condenser, goes to the tower. As a consequence capacity grows as
-    it gets hotter above -1 C outdoors, and at part load power falls.
+    First, the temperature difference from design is (T_amb - 35)/2.778 - (6.67 - 35), which ignores
+    the chilled-water temperature and is 28.33 K too large. Second, the last capacity coefficient is
+    positive. Third, the tower receives the cooling load instead of the heat rejected by the
+    condenser. As a consequence, above -1 C outdoors, capacity grows with the outdoor temperature,
+    and power at part load falls with it.
     """
     result = _electric(
         load_w,
@@ -287,10 +295,10 @@ def released(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def paper(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Appendix A.2.2 as printed: P_chiller = P_cool*(1 + 1/COP), counted as electricity.
+    """Step the chiller of the paper (appendix A.2.2): power P_chiller = P_cool*(1 + 1/COP).
 
-    The term is the heat a condenser rejects; the paper adds it to the HVAC power and hands the
-    same quantity to the tower. No capacity is printed, so none limits the load.
+    This expression is the heat that a condenser rejects, but the paper adds it to the HVAC power
+    and also passes it to the tower. The paper states no capacity, so the load is not limited.
     """
     load = np.maximum(load_w, 0.0)
     power_w = load * (1.0 + 1.0 / point.machine.reference_cop)
@@ -311,7 +319,7 @@ CHILLERS: dict[str, ChillerModel] = {
     "released": ChillerModel(released, reference_cop=3.0),
     "paper": ChillerModel(paper),
 }
-"""Chiller models by the names that ``hvac.chiller.model`` takes."""
+"""Chiller models by their names, the valid values of ``hvac.chiller.model``."""
 
 
 def _electric(
@@ -324,7 +332,10 @@ def _electric(
     reference_cop: Values,
     min_plr: Values,
 ) -> ChillerResult:
-    """Chiller:Electric: capacity from the temperature difference, full-load power from capacity."""
+    """Step a Chiller:Electric, whose capacity depends on a temperature difference ``delta_k``.
+
+    Its power at full load depends on that capacity.
+    """
     capacity = np.maximum(_quadratic(capacity_ratio, delta_k), 0.0)
     return _from_curves(
         load_w,
@@ -343,7 +354,7 @@ def _from_curves(
     part_load: tuple[float, ...],
     min_plr: Values,
 ) -> ChillerResult:
-    """Power from the energy input ratio at full load, a part-load curve, and cycling.
+    """Compute power from the energy input ratio at full load, a part-load curve, and cycling.
 
     P = Q_avail*EIR*f(max(PLR, min_plr))*min(1, PLR/min_plr) (EnergyPlus Engineering Reference,
     Chiller:Electric:EIR).
@@ -364,7 +375,7 @@ def _chiller(
     *,
     rejected_w: Values,
 ) -> ChillerResult:
-    """Result of a step, with unmet load, part-load ratio and COP from the heat and the power."""
+    """Build the result of a step, with unmet load, part-load ratio and COP."""
     load, evaporator, available, power, rejected = np.broadcast_arrays(
         load_w, evaporator_w, available_w, power_w, rejected_w
     )
@@ -380,17 +391,17 @@ def _chiller(
 
 
 def _quotient(numerator: Values, denominator: Values) -> F64:
-    """Numerator / denominator, 0 where the denominator is 0."""
+    """Return numerator / denominator, and 0 where the denominator is 0."""
     positive = np.greater(denominator, 0.0)
     result: F64 = np.where(positive, numerator / np.where(positive, denominator, 1.0), 0.0)
     return result
 
 
 def _quadratic(c: tuple[float, ...], x: Values) -> Values:
-    """c0 + c1*x + c2*x^2."""
+    """Return the quadratic c0 + c1*x + c2*x^2."""
     return c[0] + x * (c[1] + x * c[2])
 
 
 def _biquadratic(c: tuple[float, ...], x: Values, y: Values) -> Values:
-    """c0 + c1*x + c2*x^2 + c3*y + c4*y^2 + c5*x*y."""
+    """Return the biquadratic c0 + c1*x + c2*x^2 + c3*y + c4*y^2 + c5*x*y."""
     return c[0] + c[1] * x + c[2] * x**2 + c[3] * y + c[4] * y**2 + c[5] * x * y

@@ -1,7 +1,7 @@
 """Air side of the plant: CRAC setpoint, airflow, return temperature and cooling load of the hall.
 
-Setpoint, airflow and cooling load have several models each, in ``SETPOINTS``, ``CRAC_FLOWS`` and
-``COOLING_LOADS``.
+The models of the setpoint are in ``SETPOINTS``, those of the airflow in ``CRAC_FLOWS``, and those
+of the cooling load in ``COOLING_LOADS``. Arrays of shape (B,) have one value per data center.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ def symmetric_setpoint(
 
     Args:
         setpoint_c: Present setpoint, C, (B,).
-        command: Steps to move, (B,).
-        run: Equal commands in a row so far, (B,); not used.
-        last: Last command, (B,); not used.
+        command: Number of steps to move, (B,).
+        run: Number of equal commands in a row so far, (B,); not used.
+        last: Command of the previous step, (B,); not used.
         step_k: Size of a step, K, (B,).
         low_c: Lowest setpoint, C, (B,).
         high_c: Highest setpoint, C, (B,).
 
     Returns:
-        The new setpoint, C, the run unchanged, and the command, each (B,).
+        The new setpoint, in C, the unchanged ``run``, and the command, each (B,).
     """
     moved_c = np.minimum(np.maximum(setpoint_c + command * step_k, low_c), high_c)
     return moved_c, run, command
@@ -55,22 +55,23 @@ def accelerating_setpoint(
     low_c: F64,
     high_c: F64,
 ) -> tuple[F64, I64, F64]:
-    """The rule of the released SustainDC: steps grow by one from the fourth equal command on.
+    """Move the setpoint by the rule of the released SustainDC, which amplifies repeated commands.
 
-    Lowering never accelerates there, because the code compares the action's index with the change
-    it stands for; holding does count, without effect.
+    From the fourth equal command in a row on, the change grows by one step per command. Lowering
+    the setpoint is never amplified, because the released code compares the index of the action
+    with the change that the action stands for. Repeated zero commands count but move nothing.
 
     Args:
         setpoint_c: Present setpoint, C, (B,).
-        command: Steps to move, (B,).
-        run: Equal commands in a row so far, (B,).
-        last: Last command, (B,).
+        command: Number of steps to move, (B,).
+        run: Number of equal commands in a row so far, (B,).
+        last: Command of the previous step, (B,).
         step_k: Size of a step, K, (B,).
         low_c: Lowest setpoint, C, (B,).
         high_c: Highest setpoint, C, (B,).
 
     Returns:
-        The new setpoint, C, equal commands in a row, and the command, each (B,).
+        The new setpoint, in C, the number of equal commands in a row, and the command, each (B,).
     """
     continues = (command == last) & (command >= 0)
     run = run * continues + 1
@@ -83,63 +84,63 @@ SETPOINTS: dict[str, SetpointModel] = {
     "symmetric": symmetric_setpoint,
     "accelerating": accelerating_setpoint,
 }
-"""Setpoint models by the names that ``hvac.setpoint.model`` takes."""
+"""Setpoint models by their names, the valid values of ``hvac.setpoint.model``."""
 
 
 def avoid_repeats(command: F64, last: F64) -> F64:
-    """Cooling commands that differ from those of the step before at least in the last bit.
+    """Return cooling commands that differ from the previous ones at least in the last bit.
 
-    Setpoint model ``accelerating`` multiplies equal commands in a row; commands that are computed
-    must not be multiplied.
+    The setpoint model ``accelerating`` amplifies equal commands in a row. Setpoint changes that a
+    controller computes must reach the plant without this amplification.
 
     Args:
-        command: setpoint changes, in steps, (n,).
-        last: those of the step before, in steps, (n,); not a number before the first step.
+        command: Setpoint changes, in steps, (n,).
+        last: Setpoint changes of the previous step, in steps, (n,); NaN in the first step.
     """
     return np.where(command == last, np.nextafter(command, 0.0), command)
 
 
 class CracPoint(NamedTuple):
-    """Servers and CRAC units of B data centers, whose airflow a model gives."""
+    """Servers and CRAC units of B data centers: the input of models of the CRAC airflow."""
 
     it_w: F64
     """IT power, in W, (B,)."""
     it_airflow_m3s: F64
     """Airflow through the servers, in m3/s, (B,)."""
     speed: F64
-    """Fan speed that an agent commands over design speed, (B,)."""
+    """Fan speed commanded by an agent, divided by design speed, (B,)."""
     design_flow_m3s: F64
     """CRAC airflow at design, in m3/s, (B,)."""
     design_it_airflow_m3s: F64
     """Airflow through the servers at design, in m3/s, (B,)."""
     min_ratio: F64
-    """Lowest fan speed over design speed, (B,)."""
+    """Lowest fan speed divided by design speed, (B,)."""
     supply_m3s_per_w: F64
-    """CRAC airflow per IT power, in m3/(s W), (B,)."""
+    """CRAC airflow divided by IT power, in m3/(s W), (B,)."""
 
 
 FlowModel = Callable[[CracPoint], tuple[F64, F64]]
-"""CRAC airflow, in m3/s, and fan speed over design speed, each (B,)."""
+"""Function that returns CRAC airflow, in m3/s, and fan speed divided by design speed, each (B,)."""
 
 
 def constant_flow(point: CracPoint) -> tuple[F64, F64]:
-    """Airflow of fans at fixed speed, or of fans that hold the pressure under a floor."""
+    """Return the design airflow, for fans at fixed speed or fans that hold a plenum pressure."""
     return point.design_flow_m3s, np.ones_like(point.design_flow_m3s)
 
 
 def following_flow(point: CracPoint) -> tuple[F64, F64]:
-    """Airflow of fans whose speed follows the servers' airflow."""
+    """Return the airflow of fans whose speed is proportional to the airflow of the servers."""
     speed = np.clip(point.it_airflow_m3s / point.design_it_airflow_m3s, point.min_ratio, 1.0)
     return point.design_flow_m3s * speed, speed
 
 
 def per_watt_flow(point: CracPoint) -> tuple[F64, F64]:
-    """Airflow in proportion to IT power at fixed fan speed, as in the released SustainDC."""
+    """Return an airflow proportional to IT power, at fixed fan speed, as the released SustainDC."""
     return point.supply_m3s_per_w * point.it_w, np.ones_like(point.supply_m3s_per_w)
 
 
 def controlled_flow(point: CracPoint) -> tuple[F64, F64]:
-    """Airflow of fans whose speed an agent controls."""
+    """Return the airflow of fans whose speed an agent controls."""
     return point.design_flow_m3s * point.speed, point.speed
 
 
@@ -151,28 +152,29 @@ CRAC_FLOWS: dict[str, FlowModel] = {
     "per_watt": per_watt_flow,
     "controlled": controlled_flow,
 }
-"""Airflow models by the names that ``hvac.crac.flow_model`` takes."""
+"""Airflow models by their names, the valid values of ``hvac.crac.flow_model``."""
 
 
 def crac_fan_w(flow_m3s: Values, *, design_flow_m3s: Values, design_w: Values) -> F64:
-    """CRAC fan power by the affinity law, W.
+    """Compute the power of the CRAC fans by the affinity law, in W.
 
-    The released SustainDC code applies the same cube to its flow per watt of IT load, without
-    scaling it to the room: 150 W * (5.663e-5/9.438e-5)^3 = 32.4 W for the whole data center.
+    The released SustainDC code applies the same cubic law to the airflow per watt of IT load
+    instead of the airflow of the room, so the fans of its whole data center draw
+    150 W * (5.663e-5/9.438e-5)^3 = 32.4 W.
 
     Args:
         flow_m3s: Airflow, m3/s, at least 0.
         design_flow_m3s: Airflow at design power, m3/s, above 0.
-        design_w: Fan power at that airflow, W.
+        design_w: Fan power at the design airflow, W.
 
     Returns:
-        Fan power design_w * (flow/design)^3, W, (B,).
+        Fan power design_w * (flow_m3s / design_flow_m3s)^3, W, (B,).
     """
     return as_array(design_w * (flow_m3s / design_flow_m3s) ** 3)
 
 
 class HallPoint(NamedTuple):
-    """Air of the halls of B data centers, from which a model takes the cooling load."""
+    """Air in the halls of B data centers: the input of models of the cooling load."""
 
     it_w: F64
     """IT power, in W, (B,)."""
@@ -181,33 +183,34 @@ class HallPoint(NamedTuple):
     crac_flow_m3s: F64
     """CRAC airflow, in m3/s, (B,)."""
     supply_c: F64
-    """Supply air, in C, (B,)."""
+    """Supply air temperature, in C, (B,)."""
     setpoint_c: F64
-    """CRAC setpoint, in C, (B,)."""
+    """CRAC supply setpoint, in C, (B,)."""
     outlet_c: F64
-    """Mean outlet of the racks, in C, (B,)."""
+    """Mean outlet temperature of the racks, in C, (B,)."""
     air_j_per_m3_k: F64
-    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+    """Volumetric heat capacity of air, in J/(m3 K), (B,)."""
     return_approach_k: F64
-    """Return air less the mean outlet, in K, (B,)."""
+    """Return air temperature minus the mean rack outlet temperature, in K, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadModel:
-    """A model of the cooling load."""
+    """Model of the return air temperature and the cooling load of the hall."""
 
     step: Callable[[HallPoint], tuple[F64, F64]]
-    """Temperature of the return air, in C, and cooling load, in W, each (B,)."""
+    """Function that returns the return air temperature, in C, and the cooling load, in W, each
+    (B,)."""
     stores_unmet_heat: bool = False
-    """Whether heat that the plant does not remove stays in the room; other models remove whatever
-    load they compute."""
+    """True if heat that the plant does not remove stays in the room; False if the plant always
+    removes the whole load."""
 
 
 def heat_balance_load(point: HallPoint) -> tuple[F64, F64]:
-    """Return air and cooling load from the heat balance of the hall.
+    """Compute return air temperature and cooling load from the heat balance of the hall.
 
     Servers and CRAC fans heat the air: T_ret = T_sup + P_it/(rho cp V_crac), Q = P_it + P_fan.
-    Without airflow the return air has the temperature of the supply.
+    Without airflow the return air has the temperature of the supply air.
     """
     flow = point.crac_flow_m3s
     flows = flow > 0
@@ -216,20 +219,20 @@ def heat_balance_load(point: HallPoint) -> tuple[F64, F64]:
 
 
 def released_load(point: HallPoint) -> tuple[F64, F64]:
-    """Return air and cooling load of the released SustainDC.
+    """Compute return air temperature and cooling load of the released SustainDC code.
 
-    Mean rack outlet plus mean return approach; Q = rho cp V max(0, T_ret - T_set). Heat removed
-    differs from heat generated.
+    The return air temperature is the mean rack outlet plus the mean return approach, and the load
+    is Q = rho cp V max(0, T_ret - T_set). The heat removed differs from the heat generated.
     """
     return_c, load_w = paper_load(point)
     return return_c, np.maximum(load_w, 0.0)
 
 
 def paper_load(point: HallPoint) -> tuple[F64, F64]:
-    """Return air and cooling load of the SustainDC paper, A.2.2, without a lower bound.
+    """Compute return air temperature and cooling load of the SustainDC paper (A.2.2).
 
-    Mean rack outlet plus mean return approach; Q = rho cp V (T_ret - T_set), negative where the
-    return air is colder than the setpoint.
+    The return air temperature is the mean rack outlet plus the mean return approach, and the load
+    is Q = rho cp V (T_ret - T_set), negative where the return air is colder than the setpoint.
     """
     return_c = point.outlet_c + point.return_approach_k
     rise_k = return_c - point.setpoint_c
@@ -241,45 +244,45 @@ COOLING_LOADS: dict[str, LoadModel] = {
     "released": LoadModel(released_load),
     "paper": LoadModel(paper_load),
 }
-"""Cooling load models by the names that ``hvac.cooling_load_model`` takes."""
+"""Cooling load models by their names, the valid values of ``hvac.cooling_load_model``."""
 
 
 ROUND_OFF_SHARE = 1e-12
-"""Relative difference up to which two heat flows count as equal: sums over many devices have no
-more valid digits, and their last bits depend on the processor."""
+"""Relative difference up to which two heat flows count as equal. Rounding errors of sums over many
+devices are of this size and depend on the processor."""
 
 
 def balance_room_heat(
     load_w: F64, heat_removed_w: F64, room_heat_kwh: F64, step_h: float
 ) -> tuple[F64, F64, F64]:
-    """Account for cooling load that was not removed, or removed later.
+    """Update the heat stored in the room by the cooling load that the plant did not remove.
 
-    Heat generated is heat removed plus the rise of the room heat, to round-off.
+    Heat generated equals heat removed plus the rise of the stored heat, up to rounding errors.
 
     Args:
         load_w: Heat that entered the air of the room, W, (B,).
-        heat_removed_w: Heat that the plant took out, W, (B,), at most the load plus the room heat.
-        room_heat_kwh: Heat that the room held at the start of the step, kWh, (B,).
+        heat_removed_w: Heat that the plant removed, W, (B,), at most the load plus the stored heat.
+        room_heat_kwh: Heat stored in the room at the start of the step, kWh, (B,).
         step_h: Length of the step, h.
 
     Returns:
-        Unmet load, W, recovered heat, W, and the new room heat, kWh, each (B,).
+        Unmet load, W, stored heat removed, W, and the new stored heat, kWh, each (B,).
     """
     after_kwh = np.maximum(room_heat_kwh + (load_w - heat_removed_w) * step_h / 1e3, 0.0)
     return *unmet_and_recovered(load_w, heat_removed_w), after_kwh
 
 
 def unmet_and_recovered(load_w: F64, heat_removed_w: F64) -> tuple[F64, F64]:
-    """Load beyond the heat removed, and heat removed beyond the load.
+    """Return the unmet load and the heat removed in excess of the load.
 
-    Differences that are no more than rounding errors count as 0.
+    Differences within rounding errors count as 0.
 
     Args:
         load_w: Cooling load, W, (B,).
-        heat_removed_w: Heat that the plant took out, W, (B,).
+        heat_removed_w: Heat that the plant removed, W, (B,).
 
     Returns:
-        Unmet load and recovered heat, W, each (B,) and at least 0.
+        Unmet load and heat removed in excess of the load, W, each (B,) and at least 0.
     """
     round_off_w = ROUND_OFF_SHARE * np.maximum(load_w, heat_removed_w)
     unmet_w, recovered_w = load_w - heat_removed_w, heat_removed_w - load_w
