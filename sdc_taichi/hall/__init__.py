@@ -1,5 +1,5 @@
 """One hall: its floor plan, recirculation of exhaust air, placement of work, and air indices.
 
-Everything here works on one configuration or on plain arrays, without a simulator.
-Nothing here steps through time, sizes a plant or runs a Taichi kernel.
+All functions here take one configuration or plain arrays and work without a simulator.
+No function here steps through time, sizes a plant or runs a Taichi kernel.
 """

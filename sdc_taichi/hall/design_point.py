@@ -16,34 +16,33 @@ _MOST_HEIGHT_ITERATIONS = 100
 
 
 MOST_RISE_K = 40.0
-"""Largest temperature rise of the air in a server, in K: from an inlet of 27 C to 67 C, the limit
-of parts behind processors."""
+"""Largest allowed temperature rise of the air in a server, in K. With an inlet of 27 C the air
+reaches 67 C, the limit of components downstream of the processors."""
 MOST_USUAL_RISE_K = 25.0
-"""Largest usual temperature rise of the air in a server at full load, in K: most have 10 to 20 K,
-the densest 25 K."""
+"""Largest usual temperature rise of the air in a server at full load, in K. Most servers have 10 to
+20 K, the densest ones 25 K."""
 MOST_USUAL_RTI_PCT = 200.0
-"""Largest usual return temperature index, in %: open halls without cold and hot aisles have about
+"""Largest usual return temperature index, in %. Open halls without cold and hot aisles have about
 150 %."""
 LEAST_USUAL_UNIT_SHARE = 0.9
-"""Usual airflow of CRAC units, divided by the design airflow. With smaller units racks take in more
-exhaust air at full load; a tenth less is acceptable in halls that never reach full load."""
+"""Smallest usual airflow of all CRAC units, divided by the design airflow. Smaller units make racks
+take in more exhaust air at full load, but many halls never reach full load."""
 _MOST_LISTED = 3
 
 
 @dataclass(frozen=True, slots=True)
 class DesignPoint:
-    """A hall of R racks and G server groups at full load and design supply air."""
+    """Hall of R racks and G server groups at full load and design supply temperature."""
 
     supply_c: float
-    """Supply air, in C."""
+    """Supply air temperature, in C."""
     full_airflow_m3s: F64
-    """Airflow of one server of each group at an airflow ratio of 1, as volume at its inlet, in
-    m3/s, (G,): as configured, or else such that the approach temperatures close the heat balance of
-    the hall."""
+    """Airflow of one server of each group at an airflow ratio of 1, as volume at the inlet
+    temperature, in m3/s, (G,). It is configured or follows from the heat balance of the hall."""
     air_j_per_m3_k: float
-    """Heat capacity of the air by volume at the reference temperature, rho cp, in J/(m3 K)."""
+    """Volumetric heat capacity rho cp of air at the reference temperature, in J/(m3 K)."""
     crac_flow_m3s: float
-    """Airflow of all CRAC units together, in m3/s."""
+    """Total airflow of the CRAC units, in m3/s."""
     it_w: F64
     """IT power of each rack, fans included, in W, (R,)."""
     airflow_m3s: F64
@@ -52,18 +51,18 @@ class DesignPoint:
     server_rise_k: F64
     """Temperature rise of the air through the servers of each group, in K, (G,)."""
     approach_k: F64
-    """Airflow-weighted mean inlet of each rack above supply air, in K, (R,)."""
+    """Airflow-weighted mean inlet temperature of each rack minus supply air, in K, (R,)."""
     outlet_rise_k: F64
-    """Airflow-weighted mean outlet of each rack above supply air, in K, (R,)."""
+    """Airflow-weighted mean outlet temperature of each rack minus supply air, in K, (R,)."""
     height_factor: F64
-    """Exhaust share of the intake of each group divided by that of its rack, by height, (G,). Its
-    mean over the airflow of a rack is 1."""
+    """Share of exhaust air in the intake of each group divided by that of its rack, (G,). It
+    depends on height, and its airflow-weighted mean in a rack is 1."""
 
     def setpoint_over_supply_k(self, config: DataCenterConfig) -> float:
-        """Setpoint of the CRAC units less their coldest supply air, in K.
+        """Return the setpoint of the CRAC units minus their lowest supply air temperature, in K.
 
-        With control of the return air it is the rise from supply to return air at this point,
-        P/(rho cp V_crac), else 0.
+        With return air control it is the rise from supply to return air at this design point,
+        P/(rho cp V_crac); with supply air control it is 0.
 
         Args:
             config: The data center.
@@ -76,17 +75,18 @@ class DesignPoint:
 def design_point(
     config: DataCenterConfig, servers: RackServers | None = None, approach_k: F64 | None = None
 ) -> DesignPoint:
-    """Power, airflow and temperatures of every rack at full load and design supply air.
+    """Compute power, airflow and temperatures of every rack at full load and design supply air.
 
-    Outlets follow from the heat balance of a rack, T_out = T_in + P/(rho cp V).
+    Outlet temperatures follow from the heat balance of a rack, T_out = T_in + P/(rho cp V).
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``; None computes them.
-        approach_k: Inlet above supply air, K, (R,); None is as given in the config.
+        servers: Servers of the hall, see ``rack_servers``; None computes them.
+        approach_k: Inlet minus supply temperature of each rack, K, (R,); None takes the configured
+            ones.
 
     Raises:
-        ConfigError: approach temperatures that leave no room for heating the air.
+        ConfigError: The approach temperatures leave no positive temperature rise for the servers.
     """
     servers = rack_servers(config) if servers is None else servers
     approach_k = config.hall.rack_approach_k() if approach_k is None else approach_k
@@ -108,33 +108,33 @@ def design_point_at(
     approach_k: F64 | None = None,
     full_airflow_m3s: F64 | None = None,
 ) -> DesignPoint:
-    """Power, airflow and temperatures at full load with given inlets.
+    """Compute power, airflow and temperatures at full load with given inlet temperatures.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        inlet_c: Inlet of each server group, C, (G,).
+        servers: Servers of the hall, see ``rack_servers``.
+        inlet_c: Inlet temperature of each server group, C, (G,).
         height_factor: Height factors of the groups, dimensionless, (G,).
-        approach_k: Inlet above supply air, K, (R,), that the airflow of the servers follows from
-            unless it is given.
+        approach_k: Inlet minus supply temperature of each rack, K, (R,); it determines the airflow
+            of servers for which none is configured.
         full_airflow_m3s: Airflow of one server of each group at an airflow ratio of 1, m3/s, (G,);
-            None is as configured, or else as follows from ``approach_k``.
+            None takes the configured airflow, or derives it from ``approach_k``.
 
     Raises:
-        ConfigError: approach temperatures that leave no room for heating the air.
+        ConfigError: The approach temperatures leave no positive temperature rise for the servers.
     """
     supply_c, air_j_per_m3_k = config.hall.design_supply_c, servers.air.j_per_m3_k
     if full_airflow_m3s is None:
-        given_k = config.hall.rack_approach_k() if approach_k is None else approach_k
-        full_airflow_m3s = _full_airflow_m3s(config, servers, inlet_c, given_k)
+        rack_k = config.hall.rack_approach_k() if approach_k is None else approach_k
+        full_airflow_m3s = _full_airflow_m3s(config, servers, inlet_c, rack_k)
     server_w, moved = _at_full_load(config, servers, inlet_c)
     it_w = servers.per_rack(servers.count * server_w)
-    most_m3s = float(full_airflow_m3s.max())
+    largest_m3s = float(full_airflow_m3s.max())
     server_rise_k = server_w / (air_j_per_m3_k * full_airflow_m3s * moved)
-    # Servers that are alike have a share of 1, which keeps the digits of their sums.
-    moved = servers.count * (full_airflow_m3s / most_m3s) * moved
+    # Relative airflows of identical servers are exactly 1, so their sums have no rounding errors.
+    moved = servers.count * (full_airflow_m3s / largest_m3s) * moved
     rack_moved = servers.per_rack(moved)
-    airflow_m3s = most_m3s * rack_moved
+    airflow_m3s = largest_m3s * rack_moved
     inlet_rise_k = servers.per_rack(moved * (inlet_c - supply_c)) / rack_moved
     return DesignPoint(
         supply_c=supply_c,
@@ -151,14 +151,15 @@ def design_point_at(
 
 
 def _inlet_c(servers: RackServers, supply_c: float, approach_k: F64, height_factor: F64) -> F64:
-    """Inlet of each group, in C, (G,), from the approach temperature of its rack."""
+    """Return the inlet temperature of each group, in C, (G,)."""
     return np.asarray(supply_c + approach_k * height_factor + servers.inlet_offset_k)
 
 
 def _at_full_load(config: DataCenterConfig, servers: RackServers, inlet_c: F64) -> tuple[F64, F64]:
-    """Power of a server of each group with its fans, in W, and its airflow over full airflow, (G,).
+    """Return power with fans, in W, and relative airflow of one server of each group, (G,).
 
-    The airflow is the volume at the reference temperature over the volume at the inlet.
+    The relative airflow is a volume at the reference temperature divided by the full airflow at the
+    inlet temperature.
     """
     curves, full_load = config.servers.curves, np.ones(len(servers.count))
     ratio = curves.airflow_ratio(inlet_c, full_load)
@@ -168,10 +169,10 @@ def _at_full_load(config: DataCenterConfig, servers: RackServers, inlet_c: F64) 
 
 
 def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F64) -> F64:
-    """Height factors of the groups, scaled to average 1 over the airflow of each rack, (G,).
+    """Return height factors of the groups with an airflow-weighted mean of 1 in each rack, (G,).
 
-    Airflow depends on the inlet, which depends on the factors that airflow weights: the fixed point
-    is found by repeated substitution.
+    Airflow depends on the inlet temperatures, which in turn depend on the height factors. Fixed
+    point iteration resolves this dependence.
     """
     supply_c, group_approach_k = config.hall.design_supply_c, servers.per_group(approach_k)
     factor = np.ones(len(servers.count))
@@ -180,8 +181,8 @@ def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F
         full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
         airflow = servers.count * full_m3s * _at_full_load(config, servers, inlet_c)[1]
         mean = servers.per_rack(airflow * servers.height_factor) / servers.per_rack(airflow)
-        before, factor = factor, servers.height_factor / servers.per_group(mean)
-        if np.max(np.abs(factor - before)) < 1e-15:
+        previous, factor = factor, servers.height_factor / servers.per_group(mean)
+        if np.max(np.abs(factor - previous)) < 1e-15:
             break
     return factor
 
@@ -189,11 +190,11 @@ def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F
 def _full_airflow_m3s(
     config: DataCenterConfig, servers: RackServers, inlet_c: F64, approach_k: F64
 ) -> F64:
-    """Airflow of a server of each group at an airflow ratio of 1, in m3/s, (G,).
+    """Return the airflow of one server of each group at an airflow ratio of 1, in m3/s, (G,).
 
-    It is as configured, or follows from the design rise of the group. Servers with neither move air
-    in proportion to their power, so that the mean rise of their racks closes the heat balance of
-    the hall with its approach temperatures.
+    The airflow is configured or follows from the design rise of the group. Servers with neither
+    have an airflow proportional to their power. The factor is such that the mean temperature rise
+    of their racks and the approach temperatures satisfy the heat balance of the hall.
     """
     full_m3s = servers.full_airflow_m3s
     if not np.isnan(full_m3s).any():
@@ -213,7 +214,10 @@ def _full_airflow_m3s(
 
 
 def _server_rise_k(config: DataCenterConfig, approach_k: F64, air_j_per_m3_k: float) -> float:
-    """Mean temperature rise through the racks that the approach temperatures leave, in K."""
+    """Return the mean temperature rise through the racks by the hall's heat balance, in K.
+
+    It is the rise of the CRAC air minus the mean approaches of supply and return air.
+    """
     crac_rise_k = 1.0 / (air_j_per_m3_k * config.hvac.crac.supply_m3s_per_w)
     supply_k = np.mean(approach_k)
     return_k = np.mean(np.asarray(config.hall.return_approach_k))
@@ -230,15 +234,15 @@ def _server_rise_k(config: DataCenterConfig, approach_k: F64, air_j_per_m3_k: fl
 def odd_airflow(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> tuple[str, ...]:
-    """Messages about airflows at the design point that are possible, but rare.
+    """Return warnings about possible but unusual airflows at the design point.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        design: Its design point.
+        servers: Servers of the hall, see ``rack_servers``.
+        design: Design point of the hall.
 
     Raises:
-        ConfigError: servers that warm their air by more than ``MOST_RISE_K``.
+        ConfigError: Servers heat their air by more than ``MOST_RISE_K``.
     """
     if config.servers.outlet_model == "released":
         return ()
@@ -262,10 +266,10 @@ def _messages(config: DataCenterConfig, design: DesignPoint, rack_rise_k: F64) -
     airflow_m3s = float(design.airflow_m3s.sum())
     rti_pct = 100.0 * airflow_m3s / design.crac_flow_m3s
     if config.hall.inlet_model == "recirculation" and rti_pct > MOST_USUAL_RTI_PCT:
-        most = int(np.argmax(design.airflow_m3s))
+        rack = int(np.argmax(design.airflow_m3s))
         yield (
             f"hall: servers move {airflow_m3s:.4g} m3/s at the design point, most through rack "
-            f"{most} with {design.airflow_m3s[most]:.3g} m3/s, the CRAC units "
+            f"{rack} with {design.airflow_m3s[rack]:.3g} m3/s, the CRAC units "
             f"{design.crac_flow_m3s:.4g} m3/s: RTI {rti_pct:.0f} %; up to "
             f"{MOST_USUAL_RTI_PCT:g} % is usual"
         )
@@ -275,10 +279,10 @@ def _messages(config: DataCenterConfig, design: DesignPoint, rack_rise_k: F64) -
 def _small_units(config: DataCenterConfig, design: DesignPoint) -> Iterator[str]:
     crac = config.hvac.crac
     if crac.airflow_m3s is not None:
-        given_m3s = float(np.broadcast_to(crac.airflow_m3s, crac.units).sum())
-        if given_m3s < LEAST_USUAL_UNIT_SHARE * design.crac_flow_m3s:
+        units_m3s = float(np.broadcast_to(crac.airflow_m3s, crac.units).sum())
+        if units_m3s < LEAST_USUAL_UNIT_SHARE * design.crac_flow_m3s:
             yield (
-                f"hvac.crac.airflow_m3s: the units give {given_m3s:.4g} m3/s at full speed, the "
+                f"hvac.crac.airflow_m3s: the units give {units_m3s:.4g} m3/s at full speed, the "
                 f"design point takes {design.crac_flow_m3s:.4g} m3/s"
             )
     if crac.capacity_kw is not None:
@@ -292,7 +296,7 @@ def _small_units(config: DataCenterConfig, design: DesignPoint) -> Iterator[str]
 
 
 def _racks(rack_rise_k: F64, limit_k: float) -> str:
-    """Text with the racks whose temperature rise exceeds a limit, and their rises."""
+    """Return a text that names the racks whose temperature rise exceeds a limit."""
     warm = np.flatnonzero(rack_rise_k > limit_k)
     numbers = ", ".join(map(str, warm[:_MOST_LISTED]))
     left = len(warm) - _MOST_LISTED

@@ -1,8 +1,8 @@
-"""Where racks and CRAC units stand, from the measures of ``hall.layout``.
+"""Positions of racks and CRAC units, from the dimensions in ``hall.layout``.
 
-Coordinates in m: x along the rows, y across them, from one corner of the room. Even rows face
-towards larger y, odd rows towards smaller y, so that rows 0 and 1 share a cold aisle, rows 1 and 2
-a hot aisle, and so on.
+Coordinates are in m from one corner of the room, with x along the rows and y across them. The
+inlets of even rows face larger y and those of odd rows smaller y. Rows 0 and 1 thus share a cold
+aisle, rows 1 and 2 a hot aisle, and so on.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from sdc_taichi.types import F64
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """Floor plan of a hall of R racks, row by row."""
+    """Floor plan of a hall of R racks, listed row by row."""
 
     centre_m: F64
-    """Centres of the racks, x and y in m, (R, 2)."""
+    """Coordinates x and y of the rack centres, in m, (R, 2)."""
     front_m: F64
-    """Middles of the inlet faces, x and y in m, (R, 2)."""
+    """Coordinates x and y of the centres of the inlet faces, in m, (R, 2)."""
     back_m: F64
-    """Middles of the exhaust faces, x and y in m, (R, 2)."""
+    """Coordinates x and y of the centres of the exhaust faces, in m, (R, 2)."""
     facing: npt.NDArray[np.int64]
-    """1 where the inlet faces larger y, -1 where it faces smaller y, (R,)."""
+    """1 for racks whose inlet faces larger y, -1 for racks whose inlet faces smaller y, (R,)."""
     row_ends_m: tuple[float, float]
-    """x of both ends of the rows, in m."""
+    """Coordinate x of both ends of the rows, in m."""
     length_m: float
     """Length of the room along x, in m."""
     width_m: float
     """Width of the room along y, in m."""
     air_m3: float
-    """Volume of the room less that of the racks, in m3."""
+    """Volume of the room minus that of the racks, in m3."""
 
 
 def floor_plan(hall: HallConfig) -> FloorPlan:
-    """Floor plan of a hall, with racks placed row by row by the measures of its layout."""
+    """Return the floor plan of a hall by the dimensions of its layout."""
     measures = hall.layout
     row = np.arange(hall.rows)
     facing = np.where(row % 2 == 0, 1, -1)
@@ -66,10 +66,10 @@ def floor_plan(hall: HallConfig) -> FloorPlan:
 
 
 def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
-    """Distance of the middle of each row from that of row 0, in m.
+    """Return the distance of the centre line of each row from that of row 0, in m.
 
     Args:
-        measures: Depths of racks and aisles.
+        measures: Layout with the depths of racks and aisles.
         row: Row numbers, any shape; numbers below 0 give negative distances.
     """
     cold = measures.rack_depth_m + measures.cold_aisle_m
@@ -78,7 +78,7 @@ def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
 
 
 def unit_places_m(plan: FloorPlan, units: int) -> F64:
-    """Places of the CRAC units along both end walls in turn, x and y in m, (U, 2).
+    """Return x and y of the CRAC units, which alternate between both end walls, in m, (U, 2).
 
     Args:
         plan: Floor plan of the hall.
@@ -92,14 +92,14 @@ def unit_places_m(plan: FloorPlan, units: int) -> F64:
 
 
 def unit_shares(plan: FloorPlan, units: int, length_m: float) -> F64:
-    """Share of each CRAC unit in the supply of each rack, (R, U); rows sum to 1.
+    """Return the share of each CRAC unit in the supply air of each rack, (R, U); rows sum to 1.
 
-    A share falls with the distance from unit to inlet face as exp(-distance/length).
+    A share is proportional to exp(-d/length_m), with the distance d from unit to inlet face.
 
     Args:
         plan: Floor plan of the hall.
         units: Number of CRAC units, U.
-        length_m: Distance over which a share falls to 1/e, m.
+        length_m: Distance at which a share falls to 1/e, m.
     """
     places = unit_places_m(plan, units)
     distance = np.hypot(*np.moveaxis(plan.front_m[:, None] - places[None], -1, 0))

@@ -1,4 +1,8 @@
-"""Files with recirculation matrices: R, shares of exhaust air, or D, temperature rises."""
+"""Reader of files with recirculation matrices of R racks.
+
+Entry [j, i] of matrix ``R`` is the share of rack i's exhaust in the intake of rack j. Entry [j, i]
+of matrix ``D`` is the temperature rise of rack j's intake by the power of rack i, in K/W.
+"""
 
 from __future__ import annotations
 
@@ -17,24 +21,24 @@ from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_MATRIX_BYTES, ArrayFile, decoding, open_input
 
 MOST_MATRIX_RACKS = 8192
-"""Largest number of racks of a hall with a matrix of the user; the matrix takes 0.5 GB in f64."""
+"""Largest number of racks of a hall with a matrix file; such a matrix takes 0.5 GB in f64."""
 MOST_D_K_PER_W = 1000.0
-"""Highest valid entry of D, in K/W: a rack of 1 W that warms another's intake by 1,000 K."""
+"""Largest valid entry of D, in K/W."""
 
 _NPY_MAGIC = b"\x93NUMPY"
 _ROUND_OFF = 1e-9
-"""Size up to which negative shares, and negative entries of D divided by the largest, are rounding
-errors."""
+"""Largest absolute value of a negative entry that counts as a rounding error. It applies to entries
+of R, and to entries of D divided by the largest entry."""
 
 
 def read_matrix(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
-    """Kind, R or D, and numbers of a user's file, (R, R).
+    """Read a matrix file and return its kind, ``R`` or ``D``, and its numbers, (R, R).
 
-    An .npz file holds an array ``R`` or ``D``, a .csv file the numbers alone, one row per receiving
-    rack, with ``hall.recirculation.matrix_kind``.
+    An .npz file contains an array ``R`` or ``D``. A .csv file contains only numbers, one row per
+    receiving rack; ``hall.recirculation.matrix_kind`` gives its kind.
 
     Raises:
-        ConfigError: naming the file and what is wrong with it.
+        ConfigError: The file is invalid; the message names the file and the error.
     """
     kind, matrix = _read_numbers(config, path)
     racks = config.hall.racks
@@ -54,20 +58,20 @@ def read_matrix(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
 def share_matrix(
     config: DataCenterConfig, path: Path, kind: str, matrix: F64, design: DesignPoint
 ) -> F64:
-    """R of a user's R or D, (R, R).
+    """Return the matrix of exhaust shares for a matrix of kind ``R`` or ``D``, (R, R).
 
-    D is in K/W at the design airflow: T_in = T_sup + D P, from which R = M (1 + M)^-1 with
-    M = D rho cp V (Tang, Gupta and Varsamopoulos 2008).
+    D, in K/W, is defined by T_in = T_sup + D P at the design airflow. It follows that
+    R = M (1 + M)^-1 with M = D rho cp V (Tang, Gupta and Varsamopoulos 2008).
 
     Args:
         config: The data center.
-        path: File of the matrix, for errors.
-        kind: R or D.
+        path: Path of the matrix file, for error messages.
+        kind: ``R`` or ``D``.
         matrix: Numbers of the file, (R, R).
         design: Design point with the airflow of the racks.
 
     Raises:
-        ConfigError: naming the file and what is wrong with it.
+        ConfigError: The matrix is invalid; the message names the file and the error.
     """
     shares = _shares_of_heat(config, path, matrix, design) if kind == "D" else matrix
     j, i = np.unravel_index(np.argmin(shares), shares.shape)
@@ -87,7 +91,7 @@ def share_matrix(
 
 
 def _shares_of_heat(config: DataCenterConfig, path: Path, matrix: F64, design: DesignPoint) -> F64:
-    """R of D, R = M (1 + M)^-1 with M = D rho cp V, (R, R)."""
+    """Return the exhaust shares R = M (1 + M)^-1 with M = D rho cp V, (R, R)."""
     j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
     if matrix[j, i] < -_ROUND_OFF * np.max(np.abs(matrix)):
         raise ConfigError(f"{path}: D[{j}, {i}] is {matrix[j, i]:.3g} K/W; valid is at least 0")
@@ -103,7 +107,7 @@ def _shares_of_heat(config: DataCenterConfig, path: Path, matrix: F64, design: D
 
 
 def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
-    """Kind and numbers of a file, of whatever shape."""
+    """Read the kind and the numbers of a matrix file, without a check of a .csv file's shape."""
     racks, wanted = config.hall.racks, config.hall.recirculation.matrix_kind
     if racks > MOST_MATRIX_RACKS:
         raise ConfigError(
@@ -121,7 +125,7 @@ def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
 
 
 def _read_npz(path: Path, file: BinaryIO, racks: int, wanted: str | None) -> tuple[str, F64]:
-    """Kind and numbers of an .npz file, (racks, racks)."""
+    """Read the kind and the numbers of an .npz file, (racks, racks)."""
     if file.read(len(_NPY_MAGIC)) == _NPY_MAGIC:
         raise ConfigError(f"{path}: holds one array without a name; valid is an .npz with R or D")
     arrays = ArrayFile(file, path, ConfigError)
@@ -142,13 +146,13 @@ def _read_npz(path: Path, file: BinaryIO, racks: int, wanted: str | None) -> tup
 
 
 def _read_csv(path: Path, file: BinaryIO) -> F64:
-    """Numbers of a .csv file, of whatever shape."""
+    """Read the numbers of a .csv file, without a check of the shape."""
     with (
         io.TextIOWrapper(file, "utf-8-sig") as text,
         decoding(path, "rows of numbers separated by ','", ConfigError),
         warnings.catch_warnings(),
     ):
-        # NumPy warns about a file without numbers, which the check of the shape refuses.
+        # Suppress NumPy's warning about an empty file; the check of the shape reports an error.
         warnings.simplefilter("ignore", UserWarning)
         lines = (line.strip() for line in text)
         return np.loadtxt(lines, delimiter=",", ndmin=2, dtype=np.float64)

@@ -1,7 +1,8 @@
 """Supply of the racks by the CRAC units: airflow of each unit, and its share in each rack's supply.
 
-All units supply a common plenum. The share of a unit in a rack's supply depends on their distance;
-where a unit gives less than its share, as when it is down, air of the other units replaces it.
+All U units supply a common plenum of R racks. The share of a unit in a rack's supply depends on
+their distance. If a unit delivers less than its share, for example because it has failed, air of
+the other units replaces it.
 """
 
 from __future__ import annotations
@@ -13,23 +14,24 @@ from sdc_taichi.types import F64
 
 _MOST_PASSES, _LEAST_PASSES = 200, 20
 _MOST_PRODUCTS = 2e8
-"""Most products of share and weight in all passes, but for the least number of passes: about a
-second."""
+"""Largest number of products of share and weight in all passes, about a second of computing time.
+``_LEAST_PASSES`` takes precedence."""
 _WITHIN = 1e-13
-"""Relative difference at which the airflow of units and that taken from them count as equal."""
+"""Relative difference up to which the airflow of a unit and the airflow taken from it are equal."""
 _LEAST_WEIGHT = 1e-12
-"""Smallest weight of a unit, so that the only unit of a rack goes on supplying it."""
+"""Smallest weight of a unit; a positive value keeps a rack supplied that has only one unit."""
 
 
 def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
-    """Airflow of each CRAC unit at full speed, in m3/s, (U,).
+    """Return the airflow of each CRAC unit at full speed, in m3/s, (U,).
 
-    As configured; else the design airflow, divided by what the racks need of each unit and raised
-    so that the units give it with the ``spare_units`` largest of them lost.
+    If it is not configured, the design airflow is distributed in proportion to the need of the
+    racks for the air of each unit. The result is then scaled up so that the units deliver the
+    design airflow even without the ``spare_units`` largest units.
 
     Args:
-        crac: The units.
-        need_m3s: Supply air that the racks take in of each unit at the design point, m3/s, (U,).
+        crac: Configuration of the units.
+        need_m3s: Supply air that the racks take in from each unit at the design point, m3/s, (U,).
         design_m3s: Airflow of all units at the design point, m3/s.
     """
     if crac.airflow_m3s is not None:
@@ -42,17 +44,18 @@ def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
 
 
 def unit_weights(shares: F64, rack_need_m3s: F64, given_m3s: F64) -> F64:
-    """Weights of units by which their shares fit what each of them gives, at most 1, (U,).
+    """Return weights of the units that match their shares to their airflows, at most 1, (U,).
 
-    The share of unit k in the supply of rack j becomes s_jk w_k / sum_l s_jl w_l, such that what
-    the racks take of each unit, sum_j s'_jk need_j, is its part of what all give. The weights are
+    With weights w, the share of unit k in the supply of rack j is
+    s'_jk = s_jk w_k / sum_l s_jl w_l. The weights are such that the airflow that racks take from
+    each unit, sum_j s'_jk need_j, is proportional to the airflow of the unit. The weights are
     found by scaling rows and columns in turn (Deming and Stephan 1940, *On a least squares
     adjustment of a sampled frequency table*, Ann. Math. Stat. 11(4)).
 
     Args:
         shares: Shares of the units by distance; rows sum to 1, (R, U).
         rack_need_m3s: Supply air that each rack takes in, m3/s, (R,).
-        given_m3s: Airflow of each unit, m3/s; its sum does not matter, (U,).
+        given_m3s: Airflow of each unit, m3/s, (U,); only the ratios of its values matter.
     """
     wanted_m3s = given_m3s * (rack_need_m3s.sum() / given_m3s.sum())
     weight = np.ones(len(given_m3s))
@@ -68,7 +71,9 @@ def unit_weights(shares: F64, rack_need_m3s: F64, given_m3s: F64) -> F64:
 
 
 def weighted_shares(shares: F64, weight: F64) -> F64:
-    """Shares of the units after weighting, (R, U); rows sum to 1. A rack with one unit keeps it.
+    """Return the shares of the units after weighting, (R, U); rows sum to 1.
+
+    The share of a rack's only unit stays 1.
 
     Args:
         shares: Shares of the units, (R, U).
@@ -83,14 +88,14 @@ def weighted_shares(shares: F64, weight: F64) -> F64:
 def airflow_with_losses_m3s(
     full_m3s: F64, running: F64, *, coasting_ratio: float, design_m3s: float
 ) -> F64:
-    """Airflow of each unit at the design point where some are down, in m3/s, (U,).
+    """Return the airflow of each unit at the design point if some units have failed, in m3/s, (U,).
 
-    The others replace the missing air, all at one speed and up to full speed.
+    The running units replace the missing air; all have the same speed, at most full speed.
 
     Args:
         full_m3s: Airflow of each unit at full speed, m3/s, (U,).
-        running: 1 for units that run, 0 for those that are down, (U,); at least one runs.
-        coasting_ratio: Airflow of a unit that is down divided by that at full speed.
+        running: 1 for running units, 0 for failed units, (U,); at least one unit runs.
+        coasting_ratio: Airflow of a failed unit divided by its airflow at full speed.
         design_m3s: Airflow of all units at the design point, m3/s.
     """
     coasting_m3s = (1.0 - running) * coasting_ratio * full_m3s

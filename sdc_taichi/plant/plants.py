@@ -1,8 +1,8 @@
-"""Plants, which move the heat of the halls outdoors: models in ``PLANTS``.
+"""Cooling plants, which move the heat of the halls outdoors, with their models in ``PLANTS``.
 
-A water-cooled plant rejects its heat by a cooling tower. Dry plants have an air-cooled chiller,
-whose power includes the fans of its condenser; nothing evaporates in them but in the humidifier of
-outdoor air.
+A water-cooled plant rejects its heat through a cooling tower. A dry plant has an air-cooled
+chiller, whose power includes the fans of its condenser; its only water use is that of the
+humidifier of outdoor air. Arrays of shape (B,) have one value per data center.
 """
 
 from __future__ import annotations
@@ -27,67 +27,68 @@ from sdc_taichi.plant.water_side import (
 from sdc_taichi.types import F64, Values, WaterSideResult, as_array
 
 _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
-"""Fall in temperature of air that takes up water, per rise of its humidity ratio, in K."""
+"""Temperature drop of air by adiabatic humidification, divided by the rise of its humidity ratio in
+kg/kg; in K."""
 
 
 class PlantPoint(NamedTuple):
-    """Air of the hall and weather in one step of a plant."""
+    """State of the hall's air and of the weather in one step: the input of a plant model."""
 
     setpoint_c: F64
     """CRAC supply setpoint, in C, (B,)."""
     return_c: F64
-    """Air that returns to the CRAC units, in C, (B,)."""
+    """Return air temperature of the CRAC units, in C, (B,)."""
     airflow_m3s: F64
     """Airflow of the CRAC units, in m3/s, (B,)."""
     outdoor_c: F64
-    """Outdoor dry bulb, in C, (B,)."""
+    """Outdoor dry-bulb temperature, in C, (B,)."""
     wet_bulb_c: F64
-    """Outdoor wet bulb, in C, (B,)."""
+    """Outdoor wet-bulb temperature, in C, (B,)."""
 
 
 class Devices(NamedTuple):
     """Models of the devices of a plant."""
 
     chiller: ChillerModel
-    """Model of the chiller."""
+    """Chiller model."""
     tower: TowerModel
-    """Model of the cooling tower."""
+    """Cooling tower model."""
     limited: bool
-    """Whether the capacity of the devices limits the heat that the plant removes."""
+    """True if the capacity of the devices limits the heat that the plant removes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlantModel:
-    """A plant."""
+    """Plant model: its equations and the medium to which it rejects heat."""
 
     step: Callable[[F64, PlantPoint, WaterSideDesign, Devices], WaterSideResult]
-    """One step, from the heat to remove in W, (B,)."""
+    """Function that computes one step from the heat to remove, in W, (B,)."""
     dry: bool
-    """Whether the chiller rejects its heat to outdoor air, without tower and tower water."""
+    """True if the chiller rejects its heat to outdoor air, without a cooling tower."""
 
 
 def water_cooled(
     requested_w: F64, point: PlantPoint, design: WaterSideDesign, devices: Devices
 ) -> WaterSideResult:
-    """Remove up to ``requested_w`` from the chilled water and reject it by a cooling tower.
+    """Step a water-cooled plant: remove up to ``requested_w`` and reject it by a cooling tower.
 
-    Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
-    chiller makes, and returns as warm as the coils let it. The integrated economiser precools the
-    return water with tower water as cold as the weather allows; the chiller does the rest. Both
-    take the heat of the chilled-water pumps as well, so the hall gets the capacity less that heat.
-    Tower and chiller depend on each other: the tower is solved for the chiller's power at the tower
-    setpoint, then chiller and economiser at the water that the tower gives.
+    The chilled-water temperature is setpoint - coil approach, limited to the warmest water that the
+    chiller makes. The integrated economiser precools the return water with tower water as cold as
+    the weather allows, and the chiller removes the remaining heat. Economiser and chiller also
+    remove the heat of the chilled-water pumps, which reduces the capacity available to the hall.
+    Tower and chiller depend on each other. The tower is therefore solved first, with the chiller
+    power at the tower setpoint; then chiller and economiser, at the resulting water temperature.
     """
-    # The cells that run take the water of those that are down, but no more than at design.
-    most_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
-    load_w = np.minimum(requested_w, most_w) if devices.limited else requested_w
+    # Running tower cells take over the water of failed ones, but the capacity per cell is limited.
+    capacity_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
+    load_w = np.minimum(requested_w, capacity_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.setpoint_c, design)
 
     def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
         load_w = taken_w * (1.0 - economiser)
         return _run_chiller(load_w, chilled_c, condenser_c, point, design, devices)
 
-    # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
+    # The economiser is in the return pipe of the coils, upstream of the bypass of the chiller.
     taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
     return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
     coldest_c = point.wet_bulb_c + design.approach_min_k
@@ -113,7 +114,8 @@ def water_cooled(
         ),
     )
     share = _economiser_share_at(cooled.leaving_c, chilled_c, return_water_c, design)
-    # Head pressure control: a bypass keeps the chiller's water as warm as its capacity needs.
+    # Head pressure control: a bypass keeps the condenser water at or above the chiller's minimum
+    # temperature or, if its capacity is short, at or above the temperature of largest capacity.
     short = foreseen.unmet_w > 0.0
     warm_c = np.where(short, design.fullest_condenser_c, design.min_condenser_c)
     machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
@@ -139,7 +141,7 @@ def water_cooled(
 def _economiser_share_at(
     tower_water_c: F64, chilled_water_c: F64, return_water_c: F64, design: WaterSideDesign
 ) -> F64:
-    """Share of the cooling load that the economiser takes with tower water, all in C, (B,)."""
+    """Return the share of the cooling load that the economiser removes, 0..1, (B,)."""
     return design.economiser * economiser_share(
         return_water_c,
         chilled_water_c=chilled_water_c,
@@ -150,10 +152,10 @@ def _economiser_share_at(
 def _tower_setpoint_c(
     coldest_c: F64, share: F64, chilled_water_c: F64, design: WaterSideDesign
 ) -> F64:
-    """Water temperature that the tower is controlled to, in C, (B,).
+    """Return the setpoint of the water that leaves the tower, in C, (B,).
 
-    It is as cold as the economiser, or else the chiller, can use, but no colder than the weather
-    allows.
+    The setpoint is the coldest temperature that the economiser can use if it runs, else the coldest
+    that the chiller can use. It is at least the coldest temperature that the weather allows.
     """
     economiser_c = chilled_water_c - design.exchanger_approach_k
     useful_c = np.where(share > 0, economiser_c, design.min_condenser_c)
@@ -163,20 +165,20 @@ def _tower_setpoint_c(
 def air_cooled(
     requested_w: F64, point: PlantPoint, design: WaterSideDesign, devices: Devices
 ) -> WaterSideResult:
-    """Remove up to ``requested_w`` from the chilled water with a dry cooler and a chiller.
+    """Step an air-cooled plant: remove up to ``requested_w`` with a dry cooler and a chiller.
 
-    The dry cooler, with a heat exchanger in series ahead of the chiller, precools the return water.
-    At full load and full fan speed the water comes within the design approach of the outdoor air
-    when the cooler does all of the work, and with constant effectiveness
+    The dry cooler precools the return water through a heat exchanger upstream of the chiller. The
+    cooler is sized to carry the full load at full fan speed, with water leaving at the design
+    approach above outdoor air. At constant effectiveness its share of the load is
 
         share = clip((T_return - T_outdoor)/(range + approach), 0, 1)
 
-    with the design range, so that the effectiveness grows as the water flow falls. It never exceeds
-    1: no water leaves colder than the outdoor air.
+    with the design range. The effectiveness thus rises as the water flow falls, but never above 1,
+    because no water leaves colder than the outdoor air.
 
-    The heat of a cooler that needs less grows with the airflow to the power 3/4, as that of a film
-    does, and the fan power with its cube, so the fans draw the fourth power of the heat divided by
-    that at full speed.
+    At lower fan speed the heat is proportional to the airflow to the power 3/4 (film coefficient),
+    and the fan power to the airflow cubed. The fan power relative to full speed is therefore the
+    fourth power of the heat relative to full speed.
     """
     load_w = np.minimum(requested_w, design.pumped_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.setpoint_c, design)
@@ -207,18 +209,18 @@ def air_cooled(
 def air_side(
     requested_w: F64, point: PlantPoint, design: WaterSideDesign, devices: Devices
 ) -> WaterSideResult:
-    """Remove up to ``requested_w`` with outdoor air, and the rest with chilled water.
+    """Step an air-side economiser: remove heat with outdoor air, and the rest with chilled water.
 
-    Outdoor air takes the place of as much return air as the heat asks for, up to all of it:
+    Outdoor air replaces return air, as much as the heat requires and up to all of it:
 
         heat = rho V_outdoor (cp (T_return - T_outdoor) + h_fg (w_least - w_outdoor))
 
-    It is let in while its moisture stays within the envelope of the config: dew point, and relative
-    humidity at the supply setpoint. Air that is too dry is wetted up to the lowest dew point by an
-    adiabatic humidifier, the second term, or else left outside. While coils cool as well, the air
-    must be so dry that nothing condenses on them (dew point below the chilled water), so their heat
-    is sensible alone. The fans that draw it through its filters and push the return air out follow
-    the affinity law; their heat leaves with that air.
+    Outdoor air is used only if its moisture is within the configured limits of dew point and of
+    relative humidity at the supply setpoint. Air that is too dry is not used, unless an adiabatic
+    humidifier raises it to the lowest dew point (second term). While coils also cool, the dew point
+    must be below the chilled-water temperature, so that nothing condenses and the coils remove
+    sensible heat only. The power of the fans for outdoor and exhaust air follows the affinity law;
+    the heat of these fans leaves with the exhaust air.
     """
     load_w = np.minimum(requested_w, design.cooling_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.setpoint_c, design)
@@ -229,9 +231,9 @@ def air_side(
     lack = design.humidifier * np.maximum(least - ratio, 0.0)
     over_k = np.maximum(point.return_c - point.outdoor_c, 0.0)
     over_w_s_m3 = design.air_j_per_m3_k * (over_k + lack * _WETTING_K)
-    most_m3s = np.minimum(point.airflow_m3s, design.tower_air_m3s * design.outdoor_units)
+    max_m3s = np.minimum(point.airflow_m3s, design.tower_air_m3s * design.outdoor_units)
     units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
-    reachable_w = np.where(over_k > 0.0, most_m3s * over_w_s_m3, 0.0)
+    reachable_w = np.where(over_k > 0.0, max_m3s * over_w_s_m3, 0.0)
     within = (
         ((vapour_pa >= design.least_vapour_pa) | (design.humidifier > 0.0))
         & (vapour_pa <= design.most_vapour_pa)
@@ -265,16 +267,16 @@ PLANTS: dict[str, PlantModel] = {
     "air_cooled": PlantModel(air_cooled, dry=True),
     "air_side": PlantModel(air_side, dry=True),
 }
-"""Plants by the names that ``hvac.plant`` takes."""
+"""Plant models by their names, the valid values of ``hvac.plant``."""
 
 
 def plant_of(chiller: ChillerModel) -> str:
-    """Name of the plant of a chiller for which the configuration names none."""
+    """Return the name of the default plant of a chiller."""
     return "water_cooled" if chiller.tower_water else "air_cooled"
 
 
 def fits(chiller: ChillerModel, plant: PlantModel) -> bool:
-    """Whether the condenser of a chiller can be cooled as a plant does it."""
+    """Return True if the plant provides the medium that cools the chiller's condenser."""
     return chiller.outdoor_air if plant.dry else chiller.tower_water
 
 
@@ -286,7 +288,7 @@ def _run_chiller(
     design: WaterSideDesign,
     devices: Devices,
 ) -> ChillerResult:
-    """One step of the chiller of a plant, for its load in W and its waters in C, (B,) each."""
+    """Compute one step of the chiller from its load, in W, and water temperatures, in C, (B,)."""
     return devices.chiller.step(
         load_w,
         ChillerPoint(
@@ -300,7 +302,7 @@ def _run_chiller(
 
 
 def _removed_w(load_w: F64, machine: ChillerResult, devices: Devices) -> F64:
-    """Part of the load of the coils that the plant removes, in W, (B,)."""
+    """Return the part of the coil load that the plant removes, in W, (B,)."""
     return np.maximum(load_w - machine.unmet_w, 0.0) if devices.limited else load_w
 
 
@@ -317,7 +319,7 @@ def _dry(
     condenser_pump_w: F64,
     humidifier_kg_s: Values = 0.0,
 ) -> WaterSideResult:
-    """Result of a plant without tower water, whose condenser is cooled by outdoor air."""
+    """Build the result of a dry plant, which has no tower water."""
     nothing = 0.0 * removed_w
     return WaterSideResult(
         heat_removed_w=removed_w,
@@ -338,7 +340,7 @@ def _dry(
 
 
 def _vapour_pa(outdoor_c: F64, wet_bulb_c: F64, pressure_pa: F64) -> F64:
-    """Pressure of the vapour in outdoor air, Pa, (B,)."""
+    """Return the partial pressure of water vapour in outdoor air, in Pa, (B,)."""
     at_wet_bulb = moist_air.saturated_ratio(wet_bulb_c, pressure_pa)
     ratio = moist_air.humidity_ratio(outdoor_c, wet_bulb_c, at_wet_bulb)
     return as_array(pressure_pa * ratio / (moist_air.WATER_TO_DRY_AIR + ratio))

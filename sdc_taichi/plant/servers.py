@@ -1,9 +1,10 @@
-"""Power and airflow of servers against inlet temperature and load, as pure functions.
+"""Power and airflow of servers as functions of inlet temperature and load.
 
-CPU power and airflow ratio (volume at the inlet divided by that at full speed) are linear in the
-inlet temperature and shift with the load; fan power is a power of the airflow ratio (Sun et al.
-2021, *Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
-Reference, ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` holds the same curves compiled.
+CPU power and airflow ratio (volume flow at the inlet divided by that at full fan speed) are linear
+in inlet temperature and load. Fan power is a power function of the airflow ratio (Sun et al. 2021,
+*Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
+Reference, ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` has a compiled version of these
+curves.
 """
 
 from __future__ import annotations
@@ -18,78 +19,80 @@ from sdc_taichi.types import F64
 
 @dataclass(frozen=True, slots=True)
 class ServerCurves:
-    """Coefficients of the curves of one kind of server.
+    """Coefficients of the power and airflow curves of one server model.
 
     With x = min(inlet_c, curve_limit_c) and the utilisation u of the server, CPU power is
     max(idle, full*(cpu_slope*x + cpu_offset + cpu_shift*u)), the airflow ratio is
     y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power divided by
-    that at the reference is (y/fan_reference_ratio)^fan_exponent.
+    its reference value is (y/fan_reference_ratio)^fan_exponent.
     """
 
     cpu_slope_per_k: float
-    """Rise of CPU power over full power with the inlet temperature, in 1/K."""
+    """Slope of CPU power divided by full power against the inlet temperature, in 1/K."""
     cpu_offset: float
-    """CPU power over full power at an inlet of 0 C and no load."""
+    """CPU power divided by full power at an inlet of 0 C and no load."""
     cpu_shift: float
-    """Rise of CPU power over full power from no load to full load."""
+    """Increase of CPU power from no load to full load, divided by full power."""
     fan_slope_per_k: float
-    """Rise of the airflow ratio with the inlet temperature, in 1/K."""
+    """Slope of the airflow ratio against the inlet temperature, in 1/K."""
     fan_offset: float
-    """Airflow ratio at an inlet of 0 C and no load, before it is limited."""
+    """Airflow ratio at an inlet of 0 C and no load, before the limits are applied."""
     fan_shift: float
-    """Rise of the airflow ratio from no load to full load."""
+    """Increase of the airflow ratio from no load to full load."""
     fan_low: float
     """Lowest airflow ratio, at least 0."""
     fan_high: float
-    """Highest airflow ratio, inf for none."""
+    """Highest airflow ratio; inf means no upper limit."""
     fan_reference_ratio: float
     """Airflow ratio at which the fans of a server draw their reference power."""
     fan_exponent: float
-    """Exponent of fan power over the airflow ratio, 1..3."""
+    """Exponent of the airflow ratio in the fan power, 1..3."""
     curve_limit_c: float
-    """Inlet temperature above which power and airflow no longer rise, in C, inf for none."""
+    """Inlet temperature above which power and airflow no longer rise, in C; inf means no limit."""
 
     def airflow_ratio(self, inlet_c: F64, utilisation: F64) -> F64:
-        """Airflow of servers over their full airflow, dimensionless.
+        """Return the airflow of servers divided by their airflow at full fan speed, dimensionless.
 
         Args:
-            inlet_c: inlet temperature of each server in C, any shape.
-            utilisation: load of each server, 0..1, of the same shape.
+            inlet_c: Inlet temperature of each server, C, any shape.
+            utilisation: Load of each server, 0..1, of the same shape.
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         ratio = self.fan_slope_per_k * on_curve_c + self.fan_offset + self.fan_shift * utilisation
         return np.asarray(np.clip(ratio, self.fan_low, self.fan_high))
 
     def moved_ratio(self, airflow_ratio: F64, inlet_c: F64, density_ratio: DensityRatio) -> F64:
-        """Airflow over full airflow as volume at the reference temperature of ``plant.air``.
+        """Convert an airflow ratio from volume at the inlet temperature to reference temperature.
+
+        The reference temperature is ``REFERENCE_C`` of ``plant.air``.
 
         Args:
-            airflow_ratio: airflow ratio of each server, any shape.
-            inlet_c: inlet temperature of each server in C, of the same shape.
-            density_ratio: density of the air divided by that at the reference temperature.
+            airflow_ratio: Airflow ratio of each server, any shape.
+            inlet_c: Inlet temperature of each server, C, of the same shape.
+            density_ratio: Density of air divided by its value at the reference temperature.
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         return np.asarray(airflow_ratio * density_ratio.at(on_curve_c))
 
     def cpu_w(self, inlet_c: F64, utilisation: F64, full_w: F64, idle_w: F64) -> F64:
-        """Power of servers without their fans, in W.
+        """Return the power of servers without their fans, in W.
 
         Args:
-            inlet_c: inlet temperature of each server in C, any shape.
-            utilisation: load of each server, 0..1, of the same shape.
-            full_w: CPU power of each server at full load and a power ratio of 1, in W.
-            idle_w: lowest CPU power of each server, in W.
+            inlet_c: Inlet temperature of each server, C, any shape.
+            utilisation: Load of each server, 0..1, of the same shape.
+            full_w: CPU power of each server where the curve has the value 1, W.
+            idle_w: Lowest CPU power of each server, W.
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         ratio = self.cpu_slope_per_k * on_curve_c + self.cpu_offset + self.cpu_shift * utilisation
         return np.asarray(np.maximum(idle_w, full_w * ratio))
 
     def fan_w(self, airflow_ratio: F64, reference_w: F64 | float) -> F64:
-        """Power of the fans of servers, in W.
+        """Return the power of the fans of servers, in W.
 
         Args:
-            airflow_ratio: airflow ratio of each server, any shape.
-            reference_w: fan power of each server at the reference airflow ratio, in W.
+            airflow_ratio: Airflow ratio of each server, any shape.
+            reference_w: Fan power of each server at the reference airflow ratio, W.
         """
         speed = airflow_ratio / self.fan_reference_ratio
         return np.asarray(reference_w * speed**self.fan_exponent)
@@ -100,13 +103,13 @@ def linear_curve(
     ratio_at_coolest: tuple[float, float],
     ratio_at_warmest: tuple[float, float],
 ) -> tuple[float, float, float]:
-    """Slope (1/K), offset and load shift of the line through given points (Sun et al. 2021).
+    """Return slope (1/K), offset and load shift of the line through two points (Sun et al. 2021).
 
     Args:
-        inlet_range_c: coolest and warmest inlet of the curve, in C.
-        ratio_at_coolest: ratio without load and at full load, at the coolest inlet.
-        ratio_at_warmest: ratio without load and at full load, at the warmest inlet; the latter is
-            not read, since the load shift is that of the coolest inlet.
+        inlet_range_c: Coolest and warmest inlet temperature of the curve, C.
+        ratio_at_coolest: Ratios at no load and at full load, at the coolest inlet.
+        ratio_at_warmest: Ratios at no load and at full load, at the warmest inlet. The ratio at
+            full load is not used, because the load shift is taken from the coolest inlet.
     """
     coolest_c, warmest_c = inlet_range_c
     slope = (ratio_at_warmest[0] - ratio_at_coolest[0]) / (warmest_c - coolest_c)

@@ -1,9 +1,11 @@
 """Cooling towers: fan power and water temperature for the heat to reject, models in ``TOWERS``.
 
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it.
+Arguments are float64 arrays of shape (B,), B data centers, or anything that broadcasts to it.
 
-YorkCalc gives the approach (leaving water minus wet bulb) as a polynomial with 27 coefficients in
-wet bulb, range (entering minus leaving water) and the ratio of liquid to gas flow. Sources:
+YorkCalc gives the approach (leaving water minus wet-bulb temperature) as a polynomial with 27
+coefficients in wet bulb, range (entering minus leaving water temperature) and liquid-to-gas ratio.
+That ratio is the water flow divided by its reference, divided by the same ratio of the airflow.
+Sources:
 EnergyPlus Engineering Reference, CoolingTower:VariableSpeed (YorkCalc correlation, its bounds and
 the free-convection share); Modelica Buildings, Fluid.HeatExchangers.CoolingTowers.YorkCalc
 (reference flow and fan power per water flow).
@@ -21,7 +23,7 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.types import F64, Values, as_array
 
 WATER_J_PER_KG_K = 4184.0
-"""Heat capacity of water, in J/(kg K)."""
+"""Specific heat capacity of water, in J/(kg K)."""
 
 YORKCALC = np.array(
     [
@@ -42,75 +44,75 @@ YORKCALC = np.array(
         ],
     ]
 )
-"""Coefficients of the approach, in K, by the powers of the liquid to gas ratio, of the range in K
-and of the wet bulb in C."""
+"""Coefficients of the approach, in K. The axes are the powers of the liquid-to-gas ratio, of the
+range in K, and of the wet bulb in C."""
 WET_BULB_BOUNDS_C = (-34.4, 26.7)
-"""Wet bulb within which YorkCalc is evaluated, in C."""
+"""Lowest and highest wet-bulb temperature at which YorkCalc is evaluated, in C."""
 MAX_RANGE_K = 22.2
-"""Largest range at which YorkCalc is evaluated, in K."""
+"""Largest range (entering minus leaving water) at which YorkCalc is evaluated, in K."""
 MAX_LIQUID_GAS_RATIO = 8.0
-"""Largest liquid to gas ratio at which YorkCalc is evaluated."""
+"""Largest liquid-to-gas ratio at which YorkCalc is evaluated."""
 
 FREE_CONVECTION_SHARE = 0.125
-"""Share of the full-speed cooling, and of the full-speed airflow, that is left when the fan stands
-still (default of EnergyPlus)."""
+"""Cooling and airflow of a tower with its fan off, divided by those at full fan speed (default of
+EnergyPlus)."""
 MIN_AIR_RATIO = 0.2
-"""Lowest airflow of a running fan divided by that at full speed; below it the fan goes on and off
-(default of EnergyPlus)."""
+"""Lowest airflow of a running fan divided by that at full speed; for smaller mean airflows the fan
+cycles on and off (default of EnergyPlus)."""
 
 _LEAST_K = 1e-9
-"""Least difference of approaches that divides, in K."""
+"""Lower bound of a divisor that is a difference of approaches, in K; prevents division by zero."""
 
 
 class TowerPoint(NamedTuple):
     """Weather, setpoints and sizes in one step of the towers."""
 
     wet_bulb_c: Values
-    """Outdoor wet bulb, in C, (B,)."""
+    """Outdoor wet-bulb temperature, in C, (B,)."""
     outdoor_c: Values
-    """Outdoor dry bulb, in C, (B,)."""
+    """Outdoor dry-bulb temperature, in C, (B,)."""
     condenser_setpoint_c: Values
     """Setpoint of the water that leaves the tower, in C, (B,)."""
     supply_setpoint_c: Values
     """CRAC supply setpoint, in C, (B,)."""
     water_kg_s: Values
-    """Condenser water flow, in kg/s, (B,); above 0 wherever there is heat."""
+    """Condenser water flow, in kg/s, (B,); above 0 wherever there is heat to reject."""
     reference_water_kg_s: Values
-    """Water flow at which the water flow ratio is 1, in kg/s, above 0, (B,)."""
+    """Reference water flow of the liquid-to-gas ratio, in kg/s, above 0, (B,)."""
     reference_air_m3s: Values
     """Airflow at full fan speed, in m3/s, above 0, (B,)."""
     design_fan_w: Values
     """Fan power at full speed, in W, (B,)."""
     air_j_per_m3_k: Values
-    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+    """Volumetric heat capacity of air, in J/(m3 K), (B,)."""
 
 
 class TowerDesignPoint(NamedTuple):
-    """Design point and configuration from which towers are sized."""
+    """Design point and configuration: the input of tower sizing."""
 
     cooling_w: F64
     """Cooling capacity of the plant, in W, (B,)."""
     rejected_w: F64
-    """Heat to reject, in W, (B,)."""
+    """Heat that the tower rejects at design, in W, (B,)."""
     water_kg_s: F64
     """Condenser water flow, in kg/s, (B,)."""
     outdoor_c: F64
-    """Design dry bulb, in C, (B,)."""
+    """Outdoor dry-bulb temperature at design, in C, (B,)."""
     wet_bulb_c: F64
-    """Design wet bulb, in C, (B,)."""
+    """Outdoor wet-bulb temperature at design, in C, (B,)."""
     lowest_setpoint_c: F64
     """Lowest CRAC supply setpoint, in C, (B,)."""
     air_j_per_m3_k: F64
-    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+    """Volumetric heat capacity of air, in J/(m3 K), (B,)."""
     value: Callable[[str], F64]
-    """A field of section ``hvac.tower`` by its name, (B,)."""
+    """Function that returns the values of a field of section ``hvac.tower`` by its name, (B,)."""
 
 
 class TowerSize(NamedTuple):
-    """Sized towers of B data centers."""
+    """Sizes of the towers of B data centers."""
 
     reference_water_kg_s: F64
-    """Water flow at which the water flow ratio is 1, in kg/s, (B,)."""
+    """Reference water flow of the liquid-to-gas ratio, in kg/s, (B,)."""
     air_m3s: F64
     """Airflow at full fan speed, in m3/s, (B,)."""
     fan_w: F64
@@ -124,8 +126,8 @@ class TowerResult:
     fan_w: F64
     """Fan power, in W, (B,)."""
     air_ratio: F64
-    """Airflow over its design (reference) value, mean over the step, (B,); with the fan off it is
-    that of free convection, or 0 for models that have none."""
+    """Mean airflow of the step divided by its reference value, (B,). With the fan off it is the
+    airflow of free convection, or 0 for models without free convection."""
     leaving_c: F64
     """Temperature of the water that leaves the tower, in C, (B,)."""
     range_k: F64
@@ -136,22 +138,22 @@ class TowerResult:
 
 @dataclass(frozen=True, slots=True)
 class TowerModel:
-    """A tower model."""
+    """Cooling tower model: its equations and its sizing rule."""
 
     step: Callable[[Values, TowerPoint], TowerResult]
-    """One step, from the heat to reject in W, (B,): that of the chiller's condenser and what an
-    economiser takes past the chiller."""
+    """Function that computes one step from the heat to reject in W, (B,): the heat of the chiller's
+    condenser plus the heat of the economiser."""
     size: Callable[[TowerDesignPoint], TowerSize]
-    """The rule by which towers are sized."""
+    """Function that sizes the towers for a design point."""
 
 
 def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> F64:
-    """Approach of a York tower: leaving water minus wet bulb.
+    """Return the approach of a York tower: leaving water minus wet-bulb temperature, in K.
 
     Args:
-        wet_bulb_c: Outdoor wet bulb, C; evaluated within -34.4..26.7 C.
-        range_k: Entering minus leaving water, K; evaluated within 0..22.2 K.
-        liquid_gas_ratio: Water flow ratio over air flow ratio; evaluated at 8 or less.
+        wet_bulb_c: Outdoor wet-bulb temperature, C; values are clipped to -34.4..26.7 C.
+        range_k: Entering minus leaving water temperature, K; values are clipped to 0..22.2 K.
+        liquid_gas_ratio: Water flow ratio divided by airflow ratio; values are clipped to 8.
 
     Returns:
         Approach, K, at least 0.
@@ -160,37 +162,38 @@ def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: V
 
 
 def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: Values) -> F64:
-    """Largest liquid to gas ratio (least air) that reaches an approach, the inverse of YorkCalc.
+    """Invert YorkCalc: return the largest liquid-to-gas ratio (least air) for an approach.
 
-    For a given wet bulb and range the approach is a + b*x + c*x^2 in the ratio x, and b > 0
-    throughout the bounds. The root on the branch that rises from x = 0 is
-    2*(t - a)/(b + sqrt(b^2 + 4*c*(t - a))), which needs no case for c = 0.
+    For a given wet bulb and range, the approach is a + b*x + c*x^2 in the ratio x, with b > 0
+    within the bounds. For a target approach t, the root on the branch that rises from x = 0 is
+    2*(t - a)/(b + sqrt(b^2 + 4*c*(t - a))), which is also valid for c = 0.
 
     Args:
-        wet_bulb_c: Outdoor wet bulb, C.
-        range_k: Entering minus leaving water, K.
-        approach_k: Approach wanted, K.
+        wet_bulb_c: Outdoor wet-bulb temperature, C.
+        range_k: Entering minus leaving water temperature, K.
+        approach_k: Target approach, K.
 
     Returns:
-        The ratio, 0..8. It is 0 where no airflow reaches the approach, and 8, the bound of the
-        correlation, where less air than that would do.
+        The ratio, 0..8. It is 0 where no airflow reaches the approach. It is 8, the bound of the
+        correlation, where an even smaller airflow would suffice.
     """
     return _ratio_at(approach_k, *_approach_parabola(wet_bulb_c, range_k))
 
 
 def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> F64:
-    """Approach a + b*x + c*x^2 at the liquid to gas ratio x, in K."""
+    """Return the approach a + b*x + c*x^2 at the liquid-to-gas ratio x, in K."""
     x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
     return as_array(np.maximum(a + x * (b + x * c), 0.0))
 
 
 def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> F64:
-    """Liquid to gas ratio x at which a + b*x + c*x^2 is the approach, 0..8."""
+    """Return the liquid-to-gas ratio x, 0..8, that solves a + b*x + c*x^2 = approach_k."""
     above_intercept = approach_k - a
     discriminant = b**2 + 4.0 * c * above_intercept
-    # A negative discriminant has two meanings. The parabola opens downwards and stays below the
-    # approach: any airflow will do. It opens upwards and stays above: none will; then the
-    # approach also lies below the intercept, which the last line turns into 0.
+    # A negative discriminant has two possible causes. Either the parabola opens downwards and
+    # stays below the approach, so that any airflow suffices. Or it opens upwards and stays above
+    # the approach, so that no airflow suffices; in that case the approach is also below the
+    # intercept, and the last line returns 0.
     reached = discriminant >= 0.0
     root = 2.0 * above_intercept / (b + np.sqrt(np.where(reached, discriminant, 0.0)))
     ratio = np.where(reached, np.minimum(root, MAX_LIQUID_GAS_RATIO), MAX_LIQUID_GAS_RATIO)
@@ -200,19 +203,19 @@ def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> F64:
 def yorkcalc_reference_water_kg_s(
     water_kg_s: Values, *, wet_bulb_c: Values, range_k: Values, approach_k: Values
 ) -> F64:
-    """Water flow at which the flow ratio is 1, so that full air meets the design approach.
+    """Return the reference water flow for which full airflow meets the design approach, in kg/s.
 
     Args:
         water_kg_s: Design water flow, kg/s.
-        wet_bulb_c: Design wet bulb, C.
+        wet_bulb_c: Design wet-bulb temperature, C.
         range_k: Design range, K.
         approach_k: Design approach, K.
 
     Returns:
-        Reference water flow, kg/s.
+        Water flow at which the water flow ratio is 1, kg/s.
 
     Raises:
-        SdcError: The design approach lies below what any airflow reaches.
+        SdcError: No airflow reaches the design approach.
     """
     ratio = yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, approach_k)
     if np.any(ratio <= 0.0):
@@ -227,34 +230,35 @@ def yorkcalc_reference_water_kg_s(
 
 
 def design_water_kg_s(heat_w: Values, *, range_k: Values) -> Values:
-    """Condenser water flow that carries a heat with a given range, kg/s.
+    """Return the condenser water flow that carries a heat flow at a range, in kg/s.
 
     Args:
         heat_w: Heat to reject, W, (B,).
-        range_k: Entering minus leaving water, K, (B,).
+        range_k: Entering minus leaving water temperature, K, (B,).
     """
     return heat_w / (WATER_J_PER_KG_K * range_k)
 
 
 def fan_power_w(air_ratio: Values, *, design_fan_w: Values) -> Values:
-    """Fan power by the affinity law, W: design power times the cube of the flow ratio.
+    """Return the fan power by the affinity law, in W: design power times air_ratio^3.
 
     Args:
-        air_ratio: Airflow over airflow at full speed, (B,).
+        air_ratio: Airflow divided by airflow at full speed, (B,).
         design_fan_w: Fan power at full speed, W, (B,).
     """
     return design_fan_w * air_ratio**3
 
 
 def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
-    """York tower with a variable-speed fan that holds the condenser water at its setpoint.
+    """Step a York tower with a variable-speed fan that holds the condenser water at its setpoint.
 
-    All heat is rejected: the range is r = heat_w/(c*m). At full speed the leaving water may rise
-    above the setpoint. Else the fan runs as slowly as the setpoint allows, and below
-    ``MIN_AIR_RATIO`` goes on and off at that speed. With the fan off the tower keeps the share f of
-    its full-speed cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)): a tower that rejects
-    r with the fan off has r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
-    bypass keeps the water from falling below the setpoint.
+    The tower always rejects all heat: the range is r = heat_w/(c*m). If the fan cannot hold the
+    setpoint even at full speed, the leaving water is warmer than the setpoint. Otherwise the fan
+    runs as slowly as the setpoint allows. If that speed is below ``MIN_AIR_RATIO``, the fan cycles
+    on and off at ``MIN_AIR_RATIO``. With the fan off the tower has the share f of its full-speed
+    cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)). A tower with range r and fan off
+    would thus have the range r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
+    bypass prevents water colder than the setpoint.
     """
     range_k = _range_k(heat_w, point.water_kg_s)
     water_ratio = point.water_kg_s / point.reference_water_kg_s
@@ -264,11 +268,11 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
     low_speed_k = np.maximum(_approach_at(water_ratio / MIN_AIR_RATIO, *parabola), full_speed_k)
     fan_off_k = _fan_off_approach_k(point.wet_bulb_c, range_k, water_ratio)
 
-    # The ratio of the wanted approach is below that of full speed where full speed is not enough.
+    # If full speed cannot reach the wanted approach, use the liquid-to-gas ratio of full speed.
     loaded = range_k > 0.0
     ratio = np.maximum(_ratio_at(wanted_k, *parabola), np.where(loaded, water_ratio, 1.0))
     speed = np.maximum(water_ratio / ratio, MIN_AIR_RATIO)
-    # Between lowest speed and fan off the approach changes evenly with the share of time it is on.
+    # A cycling fan gives an approach that is linear in the share of time during which it is on.
     on_share = (fan_off_k - wanted_k) / np.maximum(fan_off_k - low_speed_k, _LEAST_K)
     on_share = np.where(loaded, np.clip(on_share, 0.0, 1.0), 0.0)
     air_ratio = on_share * speed + (1.0 - on_share) * FREE_CONVECTION_SHARE
@@ -282,10 +286,11 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
 
 
 def released(heat_w: Values, point: TowerPoint) -> TowerResult:
-    """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
+    """Step the tower of the released SustainDC code: fan power is cubic in the airflow.
 
-    V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)), P = P_ref*min(V/V_ref, 1)^3, and no power at all
-    below 5 C outdoors. There is no water loop: the condenser setpoint counts as reached.
+    The airflow is V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)) and the power is
+    P = P_ref*min(V/V_ref, 1)^3, or 0 below 5 C outdoors. The released code has no water loop, so
+    the leaving water is always at the condenser setpoint.
     """
     air_m3s = _air_m3s(heat_w, point)
     running = np.greater_equal(point.outdoor_c, 5.0)
@@ -300,11 +305,13 @@ def released(heat_w: Values, point: TowerPoint) -> TowerResult:
 
 
 def paper(heat_w: Values, point: TowerPoint) -> TowerResult:
-    """Appendix A.2.2 as printed: P_CT = P_ref*(V/V_ref)^-3, so less airflow costs more power.
+    """Step the tower of the paper (appendix A.2.2): P_CT = P_ref*(V/V_ref)^-3.
 
-    The paper leaves f_ct_delta to Breen et al. 2010; the temperature difference is that of the
-    released code, max(50 - (T_amb - T_set), 1). Without airflow the fan is off: the printed
-    power is infinite there. No step at 5 C and no limit at V_ref are printed.
+    With this printed exponent, less airflow needs more power. The paper refers to Breen et al. 2010
+    for f_ct_delta; this model uses the temperature difference of the released code instead,
+    max(50 - (T_amb - T_set), 1). Without airflow the fan is off, because the printed power would be
+    infinite. Unlike the released code, the paper neither switches the fan off below 5 C nor limits
+    the airflow to V_ref.
     """
     air_m3s = _air_m3s(heat_w, point)
     air_ratio = air_m3s / point.reference_air_m3s
@@ -319,10 +326,10 @@ def paper(heat_w: Values, point: TowerPoint) -> TowerResult:
 
 
 def yorkcalc_size(design: TowerDesignPoint) -> TowerSize:
-    """Size of a tower that meets its design approach with full air.
+    """Size towers so that they meet the design approach at full airflow.
 
     Raises:
-        SdcError: The design approach lies below what any airflow reaches.
+        SdcError: No airflow reaches the design approach.
     """
     return TowerSize(
         reference_water_kg_s=yorkcalc_reference_water_kg_s(
@@ -337,10 +344,10 @@ def yorkcalc_size(design: TowerDesignPoint) -> TowerSize:
 
 
 def released_size(design: TowerDesignPoint) -> TowerSize:
-    """Size of the tower of the released SustainDC code.
+    """Size towers by the rule of the released SustainDC code.
 
-    It carries the cooling load with 50 - (design outdoor - lowest setpoint) K of air, and its fan
-    draws as much power as that load at full speed.
+    The design airflow carries the cooling load with a temperature rise of
+    50 - (design outdoor - lowest setpoint) K. At full speed the fan power equals the cooling load.
     """
     rise_k = np.maximum(50.0 - (design.outdoor_c - design.lowest_setpoint_c), 1.0)
     air_m3s = design.cooling_w / (design.air_j_per_m3_k * rise_k)
@@ -348,7 +355,7 @@ def released_size(design: TowerDesignPoint) -> TowerSize:
 
 
 def paper_size(design: TowerDesignPoint) -> TowerSize:
-    """Size of the paper's tower: the printed figures for any load."""
+    """Size towers by the figures printed in the paper, whatever the load."""
     return TowerSize(
         design.water_kg_s, design.value("paper_airflow_m3s"), design.value("paper_fan_w")
     )
@@ -359,11 +366,11 @@ TOWERS: dict[str, TowerModel] = {
     "released": TowerModel(released, released_size),
     "paper": TowerModel(paper, paper_size),
 }
-"""Tower models by the names that ``hvac.tower.model`` takes."""
+"""Tower models by their names, the valid values of ``hvac.tower.model``."""
 
 
 def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Values, Values]:
-    """Coefficients of the approach in powers 0, 1, 2 of the liquid to gas ratio."""
+    """Return the coefficients of the approach in powers 0, 1 and 2 of the liquid-to-gas ratio."""
     t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
     r = np.clip(range_k, 0.0, MAX_RANGE_K)
     in_range = [[p + t * (q + t * u) for p, q, u in powers] for powers in YORKCALC]
@@ -372,21 +379,24 @@ def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Val
 
 
 def _fan_off_approach_k(wet_bulb_c: Values, range_k: Values, water_ratio: Values) -> F64:
-    """Approach by free convection alone, in K."""
+    """Return the approach with the fan off (free convection only), in K."""
     at_full_speed_k = range_k / FREE_CONVECTION_SHARE
     full_speed_k = _approach_at(water_ratio, *_approach_parabola(wet_bulb_c, at_full_speed_k))
     return as_array(full_speed_k + at_full_speed_k - range_k)
 
 
 def _range_k(heat_w: Values, water_kg_s: Values) -> F64:
-    """Range of the tower water, Q/(c*m), in K; 0 without flow."""
+    """Return the range Q/(c*m) of the tower water, in K, and 0 without water flow."""
     flowing = np.greater(water_kg_s, 0.0)
     carried = np.maximum(heat_w, 0.0) / (WATER_J_PER_KG_K * np.where(flowing, water_kg_s, 1.0))
     return as_array(np.where(flowing, carried, 0.0))
 
 
 def _air_m3s(heat_w: Values, point: TowerPoint) -> F64:
-    """Airflow that carries the heat, in m3/s, at max(50 - (T_amb - T_set), 1) K."""
+    """Return the airflow, in m3/s, that carries a heat flow at a rise of 50 - (T_amb - T_set) K.
+
+    The temperature rise is at least 1 K.
+    """
     delta_k = np.maximum(50.0 - (point.outdoor_c - point.supply_setpoint_c), 1.0)
     return as_array(np.maximum(heat_w, 0.0) / (point.air_j_per_m3_k * delta_k))
 
@@ -394,7 +404,7 @@ def _air_m3s(heat_w: Values, point: TowerPoint) -> F64:
 def _tower(
     fan_w: Values, air_ratio: Values, *, leaving_c: Values, range_k: Values, wet_bulb_c: Values
 ) -> TowerResult:
-    """Result of a step, all fields of one shape."""
+    """Build the result of a step with all fields broadcast to the same shape."""
     return TowerResult(
         *np.broadcast_arrays(fan_w, air_ratio, leaving_c, range_k, leaving_c - wet_bulb_c)
     )

@@ -1,7 +1,7 @@
-"""Make-up water of the cooling tower in one step, models in ``WATER``.
+"""Make-up water of the cooling tower in one step, by the models in ``WATER``.
 
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. One kilogram of water
-counts as one litre.
+Arguments are float64 arrays of shape (B,), B data centers, or anything that broadcasts to it. One
+kilogram of water counts as one litre.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from sdc_taichi.types import Values, WaterQuantities
 EVAPORATION_HEAT_J_PER_KG = 2.45e6
 """Heat of evaporation of water near 20 C, in J/kg."""
 MAX_EVAPORATION_PER_K = 0.002
-"""Most water that evaporates, as a share of the water flow per kelvin of range (EnergyPlus, "loss
+"""Largest evaporation, as a share of the water flow, for each kelvin of range (EnergyPlus, "loss
 factor" evaporation)."""
 PAPER_DRIFT_RATE = 0.01
-"""Drift of the paper and its code, as a share of the water used, not of the water circulated."""
+"""Drift in the paper and its released code, as a share of the water use, not of the water flow."""
 
 
 class WaterPoint(NamedTuple):
-    """Operation of the towers in one step."""
+    """Operating point of the cooling towers in one step: the input of water models."""
 
     rejected_w: Values
     """Heat that the tower rejects, in W, (B,)."""
     range_k: Values
-    """Entering less leaving tower water, in K, (B,)."""
+    """Entering minus leaving temperature of the tower water, in K, (B,)."""
     water_kg_s: Values
     """Tower water flow, in kg/s, (B,)."""
     tower_airflow_m3s: Values
-    """Airflow into the tower, in m3/s, above 0 wherever there is heat, (B,)."""
+    """Airflow into the tower, in m3/s, above 0 wherever there is heat to reject, (B,)."""
     outdoor_c: Values
-    """Outdoor dry bulb, in C, (B,)."""
+    """Outdoor dry-bulb temperature, in C, (B,)."""
     wet_bulb_c: Values
-    """Outdoor wet bulb, in C, (B,)."""
+    """Outdoor wet-bulb temperature, in C, (B,)."""
     pressure_pa: Values
     """Air pressure of the site, in Pa, (B,)."""
     return_c: Values
-    """CRAC return air, in C, (B,)."""
+    """Return air temperature of the CRAC units, in C, (B,)."""
     supply_setpoint_c: Values
     """CRAC supply setpoint, in C, (B,)."""
     cycles_of_concentration: Values
-    """Concentration of solids in the tower water divided by that in the make-up, above 1, (B,)."""
+    """Concentration of solids in tower water divided by that in make-up water, above 1, (B,)."""
     drift_share: Values
     """Drift as a share of the tower water flow, (B,)."""
     dt_s: Values
@@ -53,11 +53,12 @@ class WaterPoint(NamedTuple):
 
 
 def mass_balance(point: WaterPoint) -> WaterQuantities:
-    """Evaporation, drift and blowdown (EnergyPlus Engineering Reference, tower make-up water).
+    """Compute evaporation, drift and blowdown with all heat rejected by evaporation.
 
-    All heat is taken to leave as vapour, an upper bound (in frost a part leaves as warm air), and
-    no more than 0.2 % of the flow per kelvin of range. Blowdown = evaporation/(COC - 1) - drift,
-    at least 0.
+    This is an upper bound of evaporation, since in cold weather part of the heat leaves as warm
+    air. Evaporation is also limited to 0.2 % of the water flow for each kelvin of range. Blowdown
+    is evaporation/(cycles of concentration - 1) - drift, and at least 0 (EnergyPlus Engineering
+    Reference, tower make-up water).
     """
     latent_kg_s = np.maximum(point.rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
     evaporation_l = (
@@ -72,13 +73,13 @@ def mass_balance(point: WaterPoint) -> WaterQuantities:
 
 
 def saturated_exit(point: WaterPoint) -> WaterQuantities:
-    """Evaporation into air that leaves the tower saturated, drift and blowdown.
+    """Compute evaporation, drift and blowdown with air that leaves the tower saturated.
 
-    The heat raises the enthalpy of the tower's air from that of saturated air at the wet bulb, and
-    air leaves saturated: evaporation = m*(w_sat,out - w_in) with m the dry air (EnergyPlus
-    Engineering Reference, cooling tower make-up water, "saturated exit"). So little water
-    evaporates in frost, when the air carries heat as warmth, and much in dry heat. Drift and
-    blowdown as in ``mass_balance``.
+    The rejected heat raises the enthalpy of the tower's air, which starts at that of saturated air
+    at the wet bulb. With the mass flow m of dry air, evaporation is m*(w_sat,out - w_in)
+    (EnergyPlus Engineering Reference, cooling tower make-up water, "saturated exit"). Little water
+    thus evaporates in cold weather, when much of the heat is sensible, and much in hot dry weather.
+    Drift and blowdown are those of ``mass_balance``.
     """
     at_wet_bulb = moist_air.saturated_ratio(point.wet_bulb_c, point.pressure_pa)
     entering = moist_air.humidity_ratio(point.outdoor_c, point.wet_bulb_c, at_wet_bulb)
@@ -97,11 +98,12 @@ def saturated_exit(point: WaterPoint) -> WaterQuantities:
 
 
 def released(point: WaterPoint) -> WaterQuantities:
-    """The fit of the released SustainDC code, from the air temperatures of the room.
+    """Compute the water use of the released SustainDC code from the air temperatures of the room.
 
-    max(0, 0.044*T_wb + 0.3528*(T_ret - T_set) + 0.101) m3/h, 1 % drift on top, litres rounded to
-    4 decimals. The fit does not scale with the heat rejected, so neither with the size of the
-    data center; evaporation and blowdown are one number, reported as evaporation.
+    The use is max(0, 0.044*T_wb + 0.3528*(T_ret - T_set) + 0.101) m3/h plus 1 % drift, with litres
+    rounded to 4 decimals. This fit depends neither on the heat rejected nor on the size of the
+    data center. It does not separate evaporation from blowdown; their sum is reported as
+    evaporation.
     """
     use_m3h = 0.044 * point.wet_bulb_c + 0.3528 * (point.return_c - point.supply_setpoint_c) + 0.101
     use_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(point.dt_s)
@@ -111,9 +113,10 @@ def released(point: WaterPoint) -> WaterQuantities:
 
 
 def paper(point: WaterPoint) -> WaterQuantities:
-    """Appendix A.2.6 as printed: w = 0.044*T_wb + 0.35*range + 0.1 m3/h, max(0, w) + 0.01*w.
+    """Compute the water use of the paper (appendix A.2.6): max(0, w) + 0.01*w, in m3/h.
 
-    The drift term is printed on the unclipped w, so the use is slightly negative where w is.
+    Here w = 0.044*T_wb + 0.35*(T_ret - T_set) + 0.1. The printed drift term uses w without the
+    lower bound, so the water use is slightly negative where w is negative.
     """
     use_m3h = 0.044 * point.wet_bulb_c + (0.35 * (point.return_c - point.supply_setpoint_c) + 0.1)
     evaporation_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(point.dt_s)
@@ -127,24 +130,24 @@ WATER: dict[str, Callable[[WaterPoint], WaterQuantities]] = {
     "released": released,
     "paper": paper,
 }
-"""Water models by the names that ``hvac.water.model`` takes."""
+"""Water models by their names, the valid values of ``hvac.water.model``."""
 
 
 def _with_blowdown(
     evaporation_l: Values, drift_l: Values, cycles_of_concentration: Values
 ) -> WaterQuantities:
-    """Water of a step whose blowdown holds the concentration of solids."""
+    """Build the result of a step with the blowdown that keeps the concentration of solids."""
     blowdown_l = np.maximum(evaporation_l / (cycles_of_concentration - 1.0) - drift_l, 0.0)
     return _water(evaporation_l, drift_l, blowdown_l, evaporation_l + drift_l + blowdown_l)
 
 
 def _litres_per_m3h(dt_s: Values) -> Values:
-    """Litres that a flow of 1 m3/h gives in a step."""
+    """Return the volume, in litres, that a flow of 1 m3/h delivers in a step."""
     return 1000.0 * dt_s / 3600.0
 
 
 def _water(
     evaporation_l: Values, drift_l: Values, blowdown_l: Values, water_l: Values
 ) -> WaterQuantities:
-    """Result of a step, all fields of one shape."""
+    """Build the result of a step with all fields broadcast to the same shape."""
     return WaterQuantities(*np.broadcast_arrays(evaporation_l, drift_l, blowdown_l, water_l))

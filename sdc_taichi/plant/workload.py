@@ -1,11 +1,11 @@
 """Delay-tolerant work: defer, drain, deadlines and ages in a first-in-first-out queue.
 
-The queue is one array per data center: entry k is the work still queued that was put in by the end
-of step k, oldest step first. It never decreases along k, so length, due part and age histogram are
-read off it or are differences of two entries.
-Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step. A model decides
-how much work runs, waits or is dropped from the work that waits and that is due; ``sim.workload``
-keeps the queues.
+Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step. The models here
+compute from the waiting work and the due work how much work runs, waits or is dropped;
+``sim.workload`` stores the queues. A queue is one array per data center. Its entry k is the work
+that entered the queue by the end of step k and is still queued, oldest step first. Since entries
+never decrease along k, queue length, due work and age histogram are entries or differences of two
+entries. B is the number of data centers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from sdc_taichi.types import F64, Values, Work
 
 TASKS_PER_STEP = 100.0
-"""Capacity of a data center for one step."""
+"""Capacity of a data center in one step, in tasks."""
 
 
 class WorkPoint(NamedTuple):
@@ -28,7 +28,8 @@ class WorkPoint(NamedTuple):
     demand: F64
     """Arriving work as a share of capacity, 0..1, (B,)."""
     command: F64
-    """-1 defers all flexible work, 0 neither defers nor drains, 1 drains all that fits, (B,)."""
+    """Command of the agent, (B,): -1 defers all flexible work, 0 leaves the queue unchanged, and 1
+    runs as much queued work as capacity allows."""
     waiting: F64
     """Work in the queue, in tasks, (B,)."""
     due: F64
@@ -36,27 +37,28 @@ class WorkPoint(NamedTuple):
     flexible_share: Values
     """Share of the demand that may wait, 0..1, (B,)."""
     max_utilisation: Values
-    """Highest utilisation, 0..1, (B,); with ``tasks`` that above which no queued work runs."""
+    """Highest utilisation, 0..1, (B,); the model ``tasks`` applies it to queued work only."""
     queue_limit: Values
     """Longest queue, in tasks, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkModel:
-    """A model of work."""
+    """Model of delay-tolerant work."""
 
     step: Callable[[WorkPoint], Work]
-    """What happens to the work of a step."""
+    """Function that computes the work executed, deferred and dropped in one step."""
     due_after_steps: float
-    """Steps between the deadline of work and the step in which the model takes it as due."""
+    """Number of steps after its deadline from which work counts as due."""
 
 
 def fluid(point: WorkPoint) -> Work:
-    """Divisible work, conserved exactly: arrived = executed + queued + dropped.
+    """Step arbitrarily divisible work, with arrived = executed + queued + dropped.
 
-    Deferring queues ``-command`` of the flexible share, draining takes ``command`` of what fits
-    (paper, A.1.3). Work beyond the capacity of the step queues too. Work whose deadline has come
-    runs first, as far as capacity allows; what does not fit into the queue is dropped.
+    A negative command defers the share ``-command`` of the flexible work. A positive command drains
+    the queue with the share ``command`` of the free capacity (paper, A.1.3). Work beyond the
+    capacity of the step is queued as well. Due work runs first, as far as capacity allows. Work
+    that does not fit into the queue is dropped.
     """
     arrived = point.demand * TASKS_PER_STEP
     capacity = point.max_utilisation * TASKS_PER_STEP
@@ -74,13 +76,13 @@ def fluid(point: WorkPoint) -> Work:
 
 
 def tasks(point: WorkPoint) -> Work:
-    """Whole tasks as the released SustainDC counts them: arrived = executed + queued.
+    """Step whole tasks as the released SustainDC counts them: arrived = executed + queued.
 
     Fixed work is rounded up and flexible work down, so a step may execute one task more than
-    arrived. Tasks older than the deadline run first up to the utilisation cap; a drain takes no
-    more than the step's flexible tasks and stops at the cap. Work above the cap that nobody
-    deferred still runs, as in the released code, and so do tasks that find the queue full: they
-    count as dropped and as started.
+    arrived. Overdue tasks run first, up to the utilisation cap. A drain runs at most as many queued
+    tasks as flexible tasks arrived in the step, and stops at the cap. As in the released code,
+    arriving work that is not deferred runs even above the cap. Tasks for which the queue has no
+    room also run; they count both as dropped and as started.
     """
     fixed = np.ceil(point.demand * (1.0 - point.flexible_share) * TASKS_PER_STEP)
     flexible = np.floor(point.demand * point.flexible_share * TASKS_PER_STEP)
@@ -105,7 +107,10 @@ def _work(
     dropped: F64,
     drained: F64,
 ) -> Work:
-    """Result of a step, in tasks; ``forced`` is the due work that runs, ``drained`` other work."""
+    """Build the result of a step from amounts in tasks.
+
+    Of the queued work that runs, ``forced`` is the due part and ``drained`` the rest.
+    """
     return Work(
         utilisation=started / TASKS_PER_STEP,
         arrived_tasks=arrived,
@@ -120,8 +125,8 @@ def _work(
 
 
 def _room(queue_limit: Values, waiting: F64) -> F64:
-    """Work that still fits into a queue, in tasks, (B,)."""
-    # Rounding may leave more in a full queue than it may hold.
+    """Return the free room in the queue, in tasks, (B,)."""
+    # Rounding errors may leave slightly more work in a full queue than its limit.
     return np.maximum(queue_limit - waiting, 0.0)
 
 
@@ -129,20 +134,20 @@ MODELS: dict[str, WorkModel] = {
     "fluid": WorkModel(fluid, due_after_steps=0.0),
     "tasks": WorkModel(tasks, due_after_steps=1.0),
 }
-"""Models of work by the names that ``workload.model`` takes."""
+"""Work models by their names, the valid values of ``workload.model``."""
 NEGLIGIBLE_TASKS = 1e-9
-"""Amount of work that rounding may leave of a step whose work was taken out in parts; it has no
-age."""
+"""Largest rest of a step's queued work, in tasks, that counts as a rounding error. Such a rest is
+ignored when the age of queued work is computed."""
 UNLIMITED_TASKS = 1e30
-"""Limit in tasks that stands for no limit of a queue."""
+"""Queue limit, in tasks, that stands for an unlimited queue."""
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
-    """Queued tasks by age, (B, number of edges).
+    """Return the number of queued tasks in each age bin, (B, number of edges).
 
     Args:
-        queue: work still queued by the step that put it in, (B, L).
-        edges_steps: lower edges of the age bins in steps, rising from 0; the last bin is open.
+        queue: Cumulative queued work by step of arrival, oldest step first, (B, L) for L steps.
+        edges_steps: Lower edges of the age bins in steps, ascending from 0; the last bin is open.
     """
     last = queue.shape[1] - 1
     edges = np.asarray(edges_steps).astype(np.int64)
