@@ -1,28 +1,28 @@
-"""First guess of the exhaust mixes before the racks, from a table of a hall's steady states.
+"""Initial guess of the exhaust mixes of a hall's racks, from a table of steady states.
 
-In steady air the mixes follow from the outlets, and the outlets from the mixes: the kernel sweeps
-over the racks until they agree. A guess near the answer saves most of the sweeps. Where racks are
-loaded alike the answer depends on supply temperature and load alone, so it is computed once per
-hall for a grid of both and stored as shares of a few patterns over the racks. The kernel reads the
-table with cubics.
+The *mix* of a rack is the weighted mean of the outlet temperatures that recirculate to it. In
+steady air the mixes follow from the outlets, and the outlets from the mixes, so the kernel iterates
+over the racks until both agree. A good initial guess saves most iterations. If all racks have the
+same load, the solution depends only on supply temperature and load. It is therefore computed once
+per hall on a grid of both and stored as coefficients of a few patterns over the racks. The kernel
+interpolates the table with cubic polynomials.
 
-Worked example: a hall of two racks, each of which takes in 10 % exhaust air, all of it from the
-other rack, at a supply of 20 C and full load. Let the racks warm their air by 12 and 8 K. The
-*mix* before rack 0 is the outlet of rack 1 above the supply, and the other way round; the inlet of
-a rack is 0.1 times its mix. Starting from mixes of 0, the outlets are (12, 8) K above the supply,
-so the mixes that they make are (8, 12) K, the inlets 0.8 and 1.2 K, and the outlets then 12.8 and
-9.2 K, if the rise of a rack does not change with its inlet: the *feedback gain*, the change of an
-outlet with its mix, is 0.1. The *residual* of a search is the mix that the outlets make less the
-mix that they were computed for, here (8, 12) - (0, 0). A Newton step adds what the residual brings
-about in turn, r + w G r + w G w G r + ..., with weights w = [[0, 1], [1, 0]] and gains G = 0.1: (8,
-12) + 0.1 (12, 8) + 0.01 (8, 12) + ... = (9.29, 12.93) K, which is the answer. Racks of a real hall
-move more air as they get warmer, so gains are read off the last two steps, and few steps are
-needed.
+Worked example: a hall has two racks, whose air intake is 10 % exhaust air of the other rack. The
+supply air has 20 C, the load is full, and the racks heat their air by 12 and 8 K, independent of
+the inlet. All temperatures below are relative to the supply. The mix of rack 0 is the outlet of
+rack 1, and vice versa; the inlet of a rack is 0.1 times its mix. From mixes of 0 follow the outlets
+(12, 8) K, hence the mixes (8, 12) K, the inlets (0.8, 1.2) K, and the outlets (12.8, 9.2) K. The
+*feedback gain*, the change of an outlet divided by the change of its mix, is 0.1. The *residual* r
+is the mix that follows from the outlets minus the mix from which the outlets were computed, here
+(8, 12) - (0, 0). A Newton step is the series r + w G r + w G w G r + ..., with the weights
+w = [[0, 1], [1, 0]] and the gains G = 0.1, that is (8, 12) + 0.1 (12, 8) + 0.01 (8, 12) + ... =
+(9.29, 12.93) K, the exact solution. Racks of a real hall move more air at higher inlet
+temperatures. Their gains are estimated from the last two steps, so that few steps suffice.
 
-The answers of all supplies and loads are then written as sums of patterns. If the mixes of the two
-racks were (9.29, 12.93) K times the load everywhere, one pattern (0.58, 0.81) would hold them all,
-with shares of 15.9 K times the load; a hall has up to ``PATTERNS`` of them, the principal
-components of its table.
+The solutions at all supply temperatures and loads are then written as sums of patterns. If the
+mixes of the two racks were (9.29, 12.93) K times the load everywhere, the pattern (0.58, 0.81) with
+coefficient 15.9 K times the load would represent all of them. A hall has up to ``PATTERNS``
+patterns, the principal components of its table.
 """
 
 from __future__ import annotations
@@ -42,72 +42,74 @@ from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F32, F64, I32
 
 TABLE_LOADS = np.linspace(0.0, 1.0, 161)
-"""Loads of the table. They are close because airflow and power have kinks where their limits set
-in, at a different load for each rack and height."""
+"""Grid of loads of the table. It is fine because airflow and power have kinks at their limits, at a
+different load for each rack and height."""
 SUPPLY_STEP_K = 0.5
-"""Distance of the supply temperatures of the table, in K; setpoints move in whole or half kelvins.
-A wide range of setpoints has wider steps."""
+"""Spacing of the supply temperatures of the table, in K, chosen because setpoints change by whole
+or half kelvins. The spacing is wider if the range of setpoints is wide, see ``MOST_SUPPLIES``."""
 MOST_SUPPLIES = 65
-"""Most supply temperatures of the table of a wide range of setpoints."""
+"""Largest number of supply temperatures of the table."""
 PATTERNS = 7
-"""Largest number of patterns of a hall; they reproduce all mixes of a hall of 20 racks to 2e-4
-K."""
+"""Largest number of patterns of a hall. For 20 racks, 7 patterns reproduce all mixes to within
+2e-4 K."""
 SAMPLED_RACKS = 4
-"""Number of racks whose mean represents all racks of a hall that drops weights."""
+"""Number of sampled racks whose mean represents all racks of a hall with truncated weights."""
 
 _BATCH_VALUES, _LEAST_BATCH = 2**13, 32
-"""Number of values per batch, so that a batch fits into the processor's cache, and smallest number
-of table entries per batch."""
+"""Number of values per batch, chosen so that a batch fits into the processor's cache, and smallest
+number of table entries per batch."""
 _SECANT_K = 1e-3
-"""Smallest move of a mix, in K, from which a feedback gain is read."""
+"""Smallest change of a mix, in K, from which a feedback gain is estimated."""
 _LAST_STEP_K = 2e-3
-"""Largest Newton step that ends the search, in K; the next one would be 50 to 100 times shorter."""
+"""Newton step below which the iteration ends, in K; the next step would be 50 to 100 times
+smaller."""
 _USUAL_GAIN = 0.2
-"""Feedback gain of a usual hall, with which the search starts."""
+"""Initial value of the feedback gains, which is typical of halls."""
 _MOST_GAIN = 0.9
-"""Largest absolute feedback gain that the search uses."""
+"""Largest absolute value of a feedback gain."""
 _MOST_HEAT_K = 100.0
-"""Upper limit of the temperature rise of the air, in K. Without it, entries at almost no airflow
-would dominate the patterns."""
+"""Upper limit of the temperature rise of the air, in K. Without this limit, table entries with
+almost no airflow would dominate the patterns."""
 _MOST_PASSES = 10
-"""Most Newton steps with merged server groups."""
+"""Largest number of Newton steps with merged server groups."""
 _MOST_EXACT_PASSES = 2
-"""Most Newton steps with all server groups, from the result with merged ones."""
+"""Largest number of Newton steps with all server groups, starting from the merged solution."""
 _NEUMANN_TERMS = 4
-"""Terms of the Neumann series that solves for a Newton step."""
+"""Number of terms of the Neumann series that gives a Newton step."""
 
 
 @dataclass(frozen=True, slots=True)
 class SteadyStateTable:
-    """Steady states of a hall as shares of patterns over its racks."""
+    """Table of steady states of a hall of R racks, as coefficients of patterns over the racks."""
 
     supply_c: F64
     """Supply temperatures of the table, evenly spaced, in C, (n,)."""
     patterns: F64
-    """Patterns over the racks, (k, R). In halls of up to DENSE_RACKS they are patterns of the
-    exhaust mix above supply air. In larger halls they are, at the design point and in K, the mix of
-    approach temperatures, the mix of temperature rises, the approach temperatures and the rises of
-    the racks themselves, (4, R)."""
+    """Patterns over the racks, (k, R). In halls of up to DENSE_RACKS they are patterns of exhaust
+    mix minus supply temperature. In larger halls the shape is (4, R), and the rows are values of
+    the design point in K: mix of approach temperatures, mix of temperature rises, approach
+    temperatures, and temperature rises."""
     pattern_shares: F32
-    """How much of each pattern a steady state holds, (n, len(TABLE_LOADS), k). In larger halls k is
-    2: one share for approach temperatures, one for rises, of mixes and racks alike."""
+    """Coefficients of the patterns in each steady state, (n, len(TABLE_LOADS), k). In larger halls
+    k is 2: one coefficient scales both patterns of approaches, the other both patterns of rises."""
     feedback_gain: F32
-    """Change of a rack's outlet with a change of the mix before it, in K/K, mean over the racks,
-    (n, len(TABLE_LOADS))."""
+    """Change of a rack's outlet divided by the change of its exhaust mix, in K/K, averaged over the
+    racks, (n, len(TABLE_LOADS))."""
 
 
 def initial_guess(
     config: DataCenterConfig, servers: RackServers, recirculation: Recirculation
 ) -> SteadyStateTable:
-    """Table of the steady states of a hall whose CRAC units supply enough air for its racks.
+    """Compute the table of steady states of a hall.
 
-    All racks have the same load. Halls of up to DENSE_RACKS are computed as they are, larger ones
-    as the mean of SAMPLED_RACKS racks.
+    All racks have the same load, and the CRAC units supply enough air. In halls of up to
+    DENSE_RACKS all racks are computed; larger halls are represented by a mean of SAMPLED_RACKS
+    racks.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        recirculation: Its calibrated recirculation.
+        servers: Servers of the hall, see ``rack_servers``.
+        recirculation: Calibrated recirculation of the hall.
     """
     supply_c = _table_supplies_c(config, recirculation.design)
     dense = config.hall.racks <= DENSE_RACKS
@@ -128,7 +130,7 @@ def initial_guess(
 
 
 def _table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
-    """Supply temperatures of the table, which cover the range of setpoints, in C, (n,)."""
+    """Return supply temperatures that cover the range of setpoints, in C, (n,)."""
     setpoint = config.hvac.setpoint
     over_k = design.setpoint_over_supply_k(config)
     low_c, span_k = setpoint.min_c - over_k, setpoint.max_c - setpoint.min_c + over_k
@@ -138,22 +140,22 @@ def _table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
 
 
 class _HallPart(NamedTuple):
-    """Racks whose steady states are computed: all of a hall, or a sample of it as one rack."""
+    """Racks whose steady states are computed: all racks, or a sample merged into one rack."""
 
     group_offsets: I32
-    """First server group of each rack, (R + 1,)."""
+    """Index of the first server group of each of R racks, and the number of groups, (R + 1,)."""
     columns: F64
-    """Rows count, full power, idle power, load deviation, full airflow divided by that of the
-    largest server, fan power at the reference ratio and exhaust share of the server groups, (7,
-    G)."""
+    """Properties of the G server groups, (7, G). The rows are count, full power, idle power, load
+    deviation, full airflow divided by that of the largest server, fan power at the reference ratio,
+    and exhaust share."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     design_mix_k: F64
-    """Exhaust mix before each rack above supply air at the design point, in K, (R,)."""
+    """Exhaust mix of each rack minus supply temperature at the design point, in K, (R,)."""
 
 
 def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart:
-    """All racks of a hall."""
+    """Return all racks of a hall."""
     weights = recirculation.mix_weights
     return _HallPart(
         group_offsets=servers.group_offsets,
@@ -164,10 +166,10 @@ def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart
 
 
 def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallPart:
-    """A sample of the racks of a hall as one rack that takes in its own exhaust."""
+    """Return a sample of the racks, merged into one rack that takes in its own exhaust air."""
     offsets, outlet_rise_k = servers.group_offsets, recirculation.design.outlet_rise_k
     racks = len(outlet_rise_k)
-    # Racks at the ends of rows breathe more exhaust than others: some of each.
+    # The sample is spread over the exhaust shares, which are larger at the ends of rows.
     places = (2 * np.arange(SAMPLED_RACKS) + 1) * racks // (2 * SAMPLED_RACKS)
     sample = np.sort(np.argsort(recirculation.exhaust_share, kind="stable")[places])
     groups = np.concatenate([np.arange(*offsets[rack : rack + 2]) for rack in sample])
@@ -180,7 +182,7 @@ def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallP
 
 
 def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
-    """Values of the server groups that the steady states need, see ``_HallPart``, (7, G)."""
+    """Return the properties of the server groups for ``_HallPart.columns``, (7, G)."""
     full_m3s = recirculation.design.full_airflow_m3s
     return np.stack(
         [
@@ -202,7 +204,7 @@ def _steady_states(
     recirculation: Recirculation,
     supply_c: F64,
 ) -> _SteadyStates:
-    """Steady states of the whole table and, as the last entry, of the design point."""
+    """Compute the steady states of the whole table and, as the last entry, of the design point."""
     design = recirculation.design
     shape = len(part.design_mix_k), len(supply_c) * len(TABLE_LOADS) + 1
     states = _SteadyStates(
@@ -224,19 +226,22 @@ def _steady_states(
 
 
 def _strongest_patterns(mix_k: F64) -> tuple[F64, F64]:
-    """Principal components of the mixes, (R, m), and how much of each they hold.
+    """Return the principal components of m vectors of exhaust mixes, (R, m).
 
     Returns:
-        Patterns, (k, R), strongest first, and shares, (k, m).
+        Patterns, (k, R), strongest first, and their coefficients, (k, m).
     """
-    # Eigenvectors come weakest first; those of the small product of the table with itself take no
-    # threads.
+    # ``eigh`` sorts by ascending eigenvalue. The (R, R) product is so small that NumPy starts no
+    # threads for it.
     patterns = np.linalg.eigh(mix_k @ mix_k.T)[1].T[: -PATTERNS - 1 : -1]
     return patterns, patterns @ mix_k
 
 
 def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tuple[F64, F64]:
-    """Patterns of the design point, (4, R), and shares of approach and rise over it, (2, m)."""
+    """Return the patterns of the design point, (4, R), and their coefficients, (2, m).
+
+    The coefficients are mean approach and mean temperature rise divided by their design values.
+    """
     scales = np.concatenate([states.inlet_k, states.heat_k])
     shares = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
     design = recirculation.design
@@ -247,47 +252,47 @@ def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tup
 
 @dataclass(slots=True)
 class _SteadyStates:
-    """Search for the steady exhaust mixes of R racks at m pairs of supply temperature and load."""
+    """Solver for the steady exhaust mixes of R racks at m pairs of supply temperature and load."""
 
     curves: ServerCurves
-    """Curves of the servers."""
+    """Power and airflow curves of the servers."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     density_ratio: DensityRatio
-    """Density of the air divided by that at the reference temperature."""
+    """Density of air divided by its value at the reference temperature."""
     k_per_w: float
-    """Temperature rise of the air of the largest server per power at an airflow ratio of 1, in
-    K/W."""
+    """Temperature rise of the air divided by power, for the largest server at an airflow ratio of
+    1, in K/W."""
     supply_c: F64
     """Supply temperature of each pair, in C, (m,)."""
     load: F64
     """Load of each pair, 0..1, (m,)."""
     mix_k: F64
-    """Exhaust mix before each rack above supply air, in K, (R, m)."""
+    """Exhaust mix of each rack minus supply temperature, in K, (R, m)."""
     feedback_gain: F64
-    """Change of each rack's outlet with a change of the mix before it, in K/K, (R, m)."""
+    """Change of each rack's outlet divided by the change of its exhaust mix, in K/K, (R, m)."""
     inlet_k: F64 | None = None
-    """Airflow-weighted mean inlet of each rack above supply air, in K, (R, m)."""
+    """Airflow-weighted mean inlet of each rack minus supply temperature, in K, (R, m)."""
     heat_k: F64 | None = None
     """Temperature rise of the air through each rack, in K, (R, m)."""
 
     def solve(self, groups: F64, passes: int) -> None:
-        """Take Newton steps towards mixes that their own outlets make.
+        """Take Newton steps towards mixes that are consistent with their outlets.
 
-        With outlets T(m) of the mixes m, the residual is w T(m) - m and a step s solves
-        (1 - w G) s = residual by its Neumann series; the diagonal G holds the feedback gains, as
-        secants over the step before.
+        With the outlets T(m) at the mixes m, the residual is w T(m) - m. A step s solves
+        (1 - w G) s = residual by a Neumann series, where the diagonal matrix G contains the
+        feedback gains, estimated as secants from the previous step.
 
         Args:
-            groups: Server groups by rack, see ``_by_rack``, (7, R, most groups of a rack).
-            passes: Most steps.
+            groups: Server groups by rack, see ``_by_rack``, (7, R, largest number of groups).
+            passes: Largest number of steps.
         """
-        before: tuple[F64, F64] | None = None
+        previous: tuple[F64, F64] | None = None
         for _ in range(passes):
             outlet_k = self._outlet_k(groups)
-            if before is not None:
-                self._update_gain(outlet_k - before[1], self.mix_k - before[0])
-            before = self.mix_k, outlet_k
+            if previous is not None:
+                self._update_gain(outlet_k - previous[1], self.mix_k - previous[0])
+            previous = self.mix_k, outlet_k
             step_k = term_k = self.weights @ outlet_k - self.mix_k
             for _ in range(_NEUMANN_TERMS):
                 term_k = self.weights @ (self.feedback_gain * term_k)
@@ -297,7 +302,7 @@ class _SteadyStates:
                 break
 
     def _update_gain(self, outlet_change_k: F64, mix_change_k: F64) -> None:
-        """Feedback gains from changes, (R, m), where mixes have moved far enough."""
+        """Update feedback gains where the changes of the mixes, (R, m), are large enough."""
         gain = np.divide(
             outlet_change_k,
             mix_change_k,
@@ -307,9 +312,9 @@ class _SteadyStates:
         self.feedback_gain = np.clip(gain, -_MOST_GAIN, _MOST_GAIN)
 
     def _outlet_k(self, groups: F64) -> F64:
-        """Outlets of the racks above supply air with the present mixes, in K, (R, m).
+        """Return outlet minus supply temperatures for the present mixes, in K, (R, m).
 
-        Keeps ``inlet_k`` and ``heat_k``, of which outlets are the sum.
+        The outlet is the sum of ``inlet_k`` and ``heat_k``, which this method also updates.
         """
         rows = (row[..., None] for row in groups)
         count, full_w, idle_w, deviation, full_airflow, fan_w, exhaust_share = rows
@@ -334,7 +339,10 @@ class _SteadyStates:
 
 
 def _by_rack(group_offsets: I32, columns: F64) -> F64:
-    """Columns of server groups, (7, G), as (7, R, most groups of a rack), filled up with none."""
+    """Arrange columns of groups, (7, G), by rack as (7, R, largest number of groups).
+
+    Padding groups have a count of 0.
+    """
     sizes = np.diff(group_offsets)
     place = np.arange(int(sizes.max()))
     out = columns[:, group_offsets[:-1, None] + np.minimum(place, sizes[:, None] - 1)]
@@ -343,7 +351,7 @@ def _by_rack(group_offsets: I32, columns: F64) -> F64:
 
 
 def _merge_neighbours(group_offsets: I32, columns: F64) -> tuple[I32, F64]:
-    """One mean group for neighbours in a rack that take in the same share of exhaust air."""
+    """Merge neighbouring groups of a rack that have the same exhaust share into a mean group."""
     first = np.diff(columns[-1], prepend=np.nan) != 0.0
     first[group_offsets[:-1]] = True
     begin = np.flatnonzero(first)

@@ -1,8 +1,9 @@
-"""Weights of the exhaust mix before each rack, by how easily each exhaust reaches its inlet.
+"""Weights of the exhaust mix of each rack, by distance from exhaust faces to its inlet face.
 
-The weight w_ji of source rack i for rack j falls with the length d of the path from exhaust face to
-inlet face, exp(-d/decay), over the racks or around the ends of the rows, times the exhaust airflow
-of the source. The weights of each rack sum to 1.
+The exhaust mix of rack j is the mean outlet temperature of all source racks i with the weights
+w_ji. A weight is proportional to exp(-d/decay) times the exhaust airflow of rack i, where d is the
+length of the path from exhaust face to inlet face over the racks or around the ends of the rows.
+The weights of each rack sum to 1. R is the number of racks.
 """
 
 from __future__ import annotations
@@ -19,48 +20,49 @@ from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 from sdc_taichi.types import F64, I32, I64
 
 DENSE_RACKS = 64
-"""Largest number of racks of a hall that keeps every weight; larger halls drop weights below the
+"""Largest number of racks of a hall that stores all weights; larger halls drop weights below the
 cutoff."""
 MERGED_RACKS_PER_ROW = 64
-"""Largest number of racks of a row that is kept whole, so that neighbouring rows make one run."""
+"""Largest number of racks of a row for which weights of whole rows are stored, so that neighbouring
+rows form one run."""
 MOST_WEIGHTS = 2**27
-"""Largest number of weights, or of runs, of a hall; they take 1 GB in f64."""
+"""Largest number of weights, or of runs, of a hall; this many weights take 1 GB in f64."""
 
 
 @dataclass(frozen=True, slots=True)
 class MixWeights:
-    """Weights w of R racks as runs of neighbouring source racks.
+    """Weights w of R racks, stored as runs of consecutive source racks.
 
-    (w x)_j = norm_j * sum of weights[run_first_weight + i] * strength[run_first_rack + i] *
-    x[run_first_rack + i] over the runs of rack j and i below their length. Racks that see the same
-    surroundings share their weights.
+    The product (w x)_j is norm_j times the sum of weights[run_first_weight + i] *
+    strength[run_first_rack + i] * x[run_first_rack + i] over all runs of rack j and all
+    i < run_length. Racks with identical surroundings share their entries of ``weights``.
     """
 
     run_offsets: I32
-    """First run of each rack, and the number of runs, (R + 1,)."""
+    """Index of the first run of each rack, and the number of runs, (R + 1,)."""
     run_first_rack: I32
-    """First source rack of each run, (runs,)."""
+    """Index of the first source rack of each run, (runs,)."""
     run_length: I32
-    """Source racks of each run, (runs,)."""
+    """Number of source racks of each run, (runs,)."""
     run_first_weight: I32
-    """Entry of ``weights`` that belongs to the first source rack of each run, (runs,)."""
+    """Index into ``weights`` for the first source rack of each run, (runs,)."""
     weights: F64
-    """Relative weights of the sources, before strength and norm, (weights,)."""
+    """Relative weights of the sources, without the factors strength and norm, (weights,)."""
     strength: F64
-    """Exhaust airflow of each rack over the mean of its hall, (R,); 1 with a user's matrix, whose
-    weights already hold it."""
+    """Exhaust airflow of each rack divided by the mean of its hall, (R,). It is 1 for weights from
+    a matrix file, which already include the airflow."""
     norm: F64
     """Factor of each rack that makes its weights sum to 1, (R,)."""
 
     def apply(self, values: F64) -> F64:
-        """Product w x of the weights and rack values, (R,): the exhaust mix of outlet values."""
+        """Return the product of weights and rack values, (R,): the mix of outlet temperatures."""
         out, strong = np.zeros(len(self.norm)), values * self.strength
         for racks, sources, weights in self._slices():
             out += np.bincount(racks, weights * strong[sources], len(out))
         return out * self.norm
 
     def apply_transposed(self, values: F64) -> F64:
-        """Product of the transposed w and rack values, (R,)."""
+        """Return the product of the transposed weights and rack values, (R,)."""
         out = np.zeros(len(self.norm))
         scaled = values * self.norm
         for racks, sources, weights in self._slices():
@@ -68,7 +70,7 @@ class MixWeights:
         return out * self.strength
 
     def dense(self) -> F64:
-        """W as a matrix, receiving racks by source racks, (R, R)."""
+        """Return the weights as a matrix, receiving racks by source racks, (R, R)."""
         racks = len(self.norm)
         out = np.zeros((racks, racks))
         for rows, sources, weights in self._slices():
@@ -76,7 +78,7 @@ class MixWeights:
         return np.asarray(out * self.strength * self.norm[:, None])
 
     def row(self, rack: int) -> tuple[I64, F64]:
-        """Source racks of one rack, (n,), and their weights, which sum to 1, (n,)."""
+        """Return the n source racks of one rack, (n,), and their weights, which sum to 1, (n,)."""
         runs = slice(self.run_offsets[rack], self.run_offsets[rack + 1])
         lengths = self.run_length[runs]
         within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -85,9 +87,9 @@ class MixWeights:
         return sources, np.asarray(weights * self.strength[sources] * self.norm[rack])
 
     def _slices(self) -> Iterator[tuple[Any, Any, F64]]:
-        """Entries (row, column, weight), one position within the runs at a time."""
+        """Yield arrays (receiving rack, source rack, weight) for each position within the runs."""
         rack = np.repeat(np.arange(len(self.norm)), np.diff(self.run_offsets))
-        # Longest first, so that the runs that reach a position are the first ones.
+        # With the longest runs first, the runs that contain a position are a leading slice.
         order = np.argsort(-self.run_length, kind="stable")
         rack, first_rack = rack[order], self.run_first_rack[order]
         first_weight = self.run_first_weight[order]
@@ -97,21 +99,22 @@ class MixWeights:
 
 
 _Runs = tuple[I32, I32, I32, I32]
-"""``run_offsets``, ``run_first_rack``, ``run_length`` and ``run_first_weight``."""
+"""Tuple of ``run_offsets``, ``run_first_rack``, ``run_length`` and ``run_first_weight``."""
 
 
 def layout_weights(hall: HallConfig, airflow_m3s: F64 | None = None) -> MixWeights:
-    """Weights of a hall from its layout.
+    """Compute the weights of a hall from its layout.
 
-    A path from exhaust face to inlet face is the shorter of two: up and over the racks (rack height
-    plus distance), or along the rows and around one of their ends.
+    The path from exhaust face to inlet face is the shorter of two paths: over the racks (rack
+    height plus horizontal distance), or along the rows and around one of their ends.
 
     Args:
-        hall: Rows, measures and the decay length.
-        airflow_m3s: Airflow of each rack at the design point, m3/s, (R,); None is the same for all.
+        hall: Configuration of the hall.
+        airflow_m3s: Airflow of each rack at the design point, m3/s, (R,); None means equal
+            airflows.
 
     Raises:
-        ConfigError: a cutoff that leaves a rack no source, or more weights than fit.
+        ConfigError: The cutoff leaves a rack without sources, or leaves too many weights.
     """
     flow = np.ones(hall.racks) if airflow_m3s is None else airflow_m3s
     if hall.racks > DENSE_RACKS:
@@ -129,11 +132,12 @@ def layout_weights(hall: HallConfig, airflow_m3s: F64 | None = None) -> MixWeigh
 
 
 def dense_weights(weights: F64, airflow_m3s: F64 | None = None) -> MixWeights:
-    """Weights of a hall as one run over all racks for each rack.
+    """Build ``MixWeights`` that store all weights, with one run per rack.
 
     Args:
-        weights: Relative weights of the sources (columns) for each rack (rows), (R, R).
-        airflow_m3s: Exhaust airflow of the sources that multiplies them, m3/s, (R,); None is 1.
+        weights: Relative weights of the sources (columns) for each receiving rack (rows), (R, R).
+        airflow_m3s: Exhaust airflow of the sources, by which their weights are multiplied, m3/s,
+            (R,); None means equal airflows.
     """
     racks = len(weights)
     index = np.arange(racks, dtype=np.int32)
@@ -148,7 +152,7 @@ def dense_weights(weights: F64, airflow_m3s: F64 | None = None) -> MixWeights:
 
 
 def _normalised(runs: _Runs, weights: F64, airflow_m3s: F64) -> MixWeights:
-    """Weights with the norms that make those of each rack sum to 1."""
+    """Build ``MixWeights`` with norms that make the weights of each rack sum to 1."""
     strength = airflow_m3s / airflow_m3s.mean()
     racks = len(strength)
     sums = MixWeights(*runs, weights, strength, np.ones(racks)).apply(np.ones(racks))
@@ -158,14 +162,14 @@ def _normalised(runs: _Runs, weights: F64, airflow_m3s: F64) -> MixWeights:
 def _path_m(
     hall: HallConfig, front_x: F64, back_x: F64, across: F64, row_ends: tuple[float, float]
 ) -> F64:
-    """Length of the shorter path from exhaust faces to inlet faces, in m.
+    """Return the length of the shorter path from exhaust faces to inlet faces, in m.
 
     Args:
-        hall: Gives the height of the racks.
-        front_x: x of the inlet faces, m.
-        back_x: x of the exhaust faces, m.
-        across: Distance from exhaust to inlet faces across the rows, m.
-        row_ends: x of both ends of the rows, m.
+        hall: Configuration of the hall, with the height of the racks.
+        front_x: Coordinate x of the inlet faces, m.
+        back_x: Coordinate x of the exhaust faces, m.
+        across: Distance from exhaust to inlet faces in direction y, across the rows, m.
+        row_ends: Coordinate x of both ends of the rows, m.
     """
     over = hall.layout.rack_height_m + np.hypot(front_x - back_x, across)
     around = np.minimum(*(np.abs(back_x - end) + np.abs(front_x - end) for end in row_ends))
@@ -173,46 +177,52 @@ def _path_m(
 
 
 def _path_weights(hall: HallConfig, path_m: F64, shortest_m: F64) -> F64:
-    """Weights of a rack's sources divided by that of its nearest; the scale cancels in its norm."""
+    """Return the weights of a rack's sources divided by the weight of its nearest source.
+
+    The factor ``norm`` of the rack cancels this scale, which prevents underflow.
+    """
     return np.asarray(np.exp((shortest_m - path_m) / hall.recirculation.decay_m))
 
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """Sources around a rack at place p of a row of P that may lie within reach."""
+    """Range of rows and places that contains all sources within reach of a rack.
+
+    A rack has place p in a row of P racks.
+    """
 
     row_shifts: I64
-    """Rows of the sources less the row of the rack, -S..S, (2 S + 1,)."""
+    """Row of the source minus row of the rack, -S..S, (2 S + 1,)."""
     first_place: I64
-    """First place of the sources in their rows, (P,)."""
+    """First place of the sources in their row, for each place of the rack, (P,)."""
     end_place: I64
-    """Place after the last source in their rows, (P,)."""
+    """Place after the last source in its row, for each place of the rack, (P,)."""
     whole_rows: bool
-    """Whether rows are kept whole, so that those beside each other make one run."""
+    """True if the range contains whole rows, so that neighbouring rows form one run."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Blocks:
-    """Weights of a rack by the parity of its row and its place p in a row of P.
+    """Blocks of weights, one for each row parity (even or odd) and each of P places in a row.
 
-    Rows of one parity face alike, so that their racks share weights. The block of a rack holds the
-    weights of its window, row by row.
+    Rows of equal parity have the same orientation, so their racks share weights. The block of a
+    rack contains the weights of its ``_Window``, row by row.
     """
 
     first_weight: I64
-    """Where the block of each parity and place begins, (2, P)."""
+    """Index into ``weights`` of the first weight of each block, (2, P)."""
     first_near: I64
     """First source within reach in each row of the window, (2, P, 2 S + 1)."""
     end_near: I64
     """Place after the last source within reach in each row of the window, (2, P, 2 S + 1)."""
     weights: F64
-    """Weights of all blocks, 0 beyond reach."""
+    """Weights of all blocks, one after the other; 0 for sources beyond reach."""
 
 
 def _truncated_weights(hall: HallConfig) -> tuple[_Runs, F64]:
-    """Runs and weights of the sources above the cutoff, for halls of more than DENSE_RACKS.
+    """Compute runs and weights above the cutoff, for halls of more than DENSE_RACKS racks.
 
-    Every second row sees the same surroundings, so that weights are kept once for each parity and
+    Every second row has the same surroundings, so weights are stored once for each row parity and
     place in a row.
     """
     reach_m = _reach_m(hall)
@@ -223,18 +233,21 @@ def _truncated_weights(hall: HallConfig) -> tuple[_Runs, F64]:
 
 
 def _rack_x_m(hall: HallConfig) -> F64:
-    """X of the racks of a row from its end, in m, (P,)."""
+    """Return the distance of the P racks of a row from its first end, in m, (P,)."""
     places: F64 = np.arange(hall.racks_per_row, dtype=np.float64)
     return (places + 0.5) * hall.layout.rack_pitch_m
 
 
 def _row_ends_m(hall: HallConfig) -> tuple[float, float]:
-    """X of both ends of the rows, in m, from the first."""
+    """Return the distance of both ends of the rows from the first end, in m."""
     return 0.0, hall.racks_per_row * hall.layout.rack_pitch_m
 
 
 def _across_m(measures: LayoutConfig, parity: int, shifts: I64) -> F64:
-    """Distance across the rows from exhausts of rows a + shifts to inlets of row a, in m."""
+    """Return the distance in y from exhausts of rows parity + shifts to inlets of row parity.
+
+    The distance is in m and has the shape of ``shifts``.
+    """
     source = parity + shifts
     half = measures.rack_depth_m / 2
     inlet = row_distance_m(measures, np.array(parity)) + (half if parity == 0 else -half)
@@ -243,10 +256,10 @@ def _across_m(measures: LayoutConfig, parity: int, shifts: I64) -> F64:
 
 
 def _reach_m(hall: HallConfig) -> float:
-    """Longest path whose weight is kept, in m.
+    """Return the length of the longest path whose weight is stored, in m.
 
-    A weight is dropped below the cutoff times the sum of weights of a rack amid the hall. Weights
-    are compared by their paths, since a weight by itself may be too small for a number.
+    A weight is dropped if it is below the cutoff times the sum of weights of a rack in the middle
+    of the hall. Path lengths are compared instead of weights, because weights may underflow.
     """
     rows, cutoff = hall.rows, hall.recirculation.cutoff
     x = _rack_x_m(hall)
@@ -262,13 +275,13 @@ def _reach_m(hall: HallConfig) -> float:
 
 
 def _window(hall: HallConfig, reach_m: float) -> _Window:
-    """Rows and places around a rack that paths of a given length may reach.
+    """Return the rows and places around a rack that paths of a given length may reach.
 
     Raises:
-        ConfigError: more weights than fit.
+        ConfigError: The cutoff leaves more than ``MOST_WEIGHTS`` weights.
     """
     rows, per_row, measures = hall.rows, hall.racks_per_row, hall.layout
-    # Racks are nearer than their rows by the depth of one.
+    # The distance of faces is smaller than that of the centre lines of rows by one rack depth.
     spacing_m = measures.rack_depth_m + min(measures.cold_aisle_m, measures.hot_aisle_m)
     row_reach = int(np.clip((reach_m + measures.rack_depth_m) / spacing_m, 0, rows - 1))
     place = np.arange(per_row)
@@ -293,10 +306,10 @@ def _window(hall: HallConfig, reach_m: float) -> _Window:
 
 
 def _weight_blocks(hall: HallConfig, window: _Window, reach_m: float) -> _Blocks:
-    """Weights of racks at every place of rows of both parities.
+    """Compute the weights of the racks at every place of even and odd rows.
 
     Raises:
-        ConfigError: a cutoff that leaves a rack no source.
+        ConfigError: The cutoff leaves a rack without sources.
     """
     x = _rack_x_m(hall)
     blocks = []
@@ -321,7 +334,7 @@ def _weight_blocks(hall: HallConfig, window: _Window, reach_m: float) -> _Blocks
 
 
 def _no_source(hall: HallConfig, place: int, short_of_reach_m: float) -> ConfigError:
-    """Error of a rack whose nearest source lies beyond reach."""
+    """Return the error for a rack whose nearest source is beyond reach."""
     cutoff, decay_m = hall.recirculation.cutoff, hall.recirculation.decay_m
     return ConfigError(
         f"hall.recirculation.cutoff {cutoff:g} with decay_m {decay_m:g} leaves racks at place "
@@ -331,13 +344,13 @@ def _no_source(hall: HallConfig, place: int, short_of_reach_m: float) -> ConfigE
 
 
 def _shift_bounds(hall: HallConfig, window: _Window, row: I64) -> tuple[I64, I64]:
-    """First and last row shift of the window that lies within the hall, for racks of given rows."""
+    """Return the first and the last row shift of the window inside the hall, for each row."""
     row_reach = int(window.row_shifts[-1])
     return np.maximum(-row_reach, -row), np.minimum(row_reach, hall.rows - 1 - row)
 
 
 def _merged_runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
-    """One run for each rack, over whole rows beside each other."""
+    """Build one run per rack, which extends over neighbouring whole rows."""
     per_row, row_reach = hall.racks_per_row, window.row_shifts[-1]
     row, place = np.divmod(np.arange(hall.racks), per_row)
     first_shift, last_shift = _shift_bounds(hall, window, row)
@@ -351,13 +364,13 @@ def _merged_runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
 
 
 def _runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
-    """One run for each rack and each row of its window, from first to last source within reach."""
+    """Build one run per rack and row of its window, from first to last source within reach."""
     per_row, row_reach = hall.racks_per_row, window.row_shifts[-1]
     row, place = np.divmod(np.arange(hall.racks), per_row)
     first_shift, last_shift = _shift_bounds(hall, window, row)
     counts = last_shift - first_shift + 1
     run_offsets = np.concatenate([[0], np.cumsum(counts)])
-    # Each run has a rack, a row of sources, and the row and place of its rack.
+    # The following arrays have one entry per run.
     rack = np.repeat(np.arange(hall.racks), counts)
     shift = first_shift[rack] + np.arange(len(rack)) - run_offsets[rack]
     row, place = row[rack], place[rack]
@@ -370,7 +383,7 @@ def _runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
 
 
 def _as_runs(run_offsets: I64, first_rack: I64, length: I64, first_weight: I64) -> _Runs:
-    """Runs as the 32-bit integers that the kernels take."""
+    """Convert runs to the 32-bit integers that the kernels require."""
     return (
         run_offsets.astype(np.int32),
         first_rack.astype(np.int32),

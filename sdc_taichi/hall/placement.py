@@ -1,8 +1,8 @@
 """Placement of work: distribution of a data center's utilisation over its racks or server groups.
 
-Bins are the places for work, racks or groups of equal servers, in one array for all data centers.
-Work is conserved: the loads, weighted by the servers of each bin, sum to the utilisation, as far as
-the usable servers suffice.
+A bin is a rack or a group of equal servers. The n bins of all B data centers are in one array. Work
+is conserved as far as the capacity of the bins suffices: the mean of the loads, weighted by the
+number of servers, equals the utilisation of the data center.
 """
 
 from __future__ import annotations
@@ -18,55 +18,55 @@ from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.types import F64, I64
 
 POLICIES = ("uniform", "fill", "coolest-first", "inlet-aware", "weights")
-"""Policies by the names that ``workload.placement`` takes."""
+"""Names of the placement policies, the valid values of ``workload.placement``."""
 MIN_HEADROOM_K = 0.1
-"""Headroom, in K, that a bin at or above its limit counts as having under ``inlet-aware``."""
+"""Lower bound of the headroom of a bin under ``inlet-aware``, in K."""
 _LEAST_WEIGHT = 1e-100
-"""Smallest weight over the largest of a data center; smaller positive weights count as this."""
+"""Lower bound of positive weights divided by the largest weight of the data center."""
 
 Mask = npt.NDArray[np.bool_]
 
 
 class PlacementError(SdcError):
-    """Work cannot be placed as asked."""
+    """Placement weights are invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Places for work in B data centers, n in all: racks, or groups of equal servers."""
+    """The n bins (racks, or groups of equal servers) of B data centers."""
 
     offsets: I64
-    """First bin of each data center, and the number of bins, (B + 1,)."""
+    """Index of the first bin of each data center, and the number of bins, (B + 1,)."""
     dc: I64
-    """Data center of each bin, (n,)."""
+    """Index of the data center of each bin, (n,)."""
     names: tuple[str, ...]
-    """Name of each data center, for errors, (B,)."""
+    """Name of each data center, for error messages, (B,)."""
     by_size: tuple[I64, ...]
-    """Bins of the data centers of similar size, one row a data center; index n fills shorter rows
-    up."""
+    """Matrices of bin indices, one for each class of data centers of similar size. Each row lists
+    the bins of one data center, padded with the index n."""
 
     def sums(self, values: npt.NDArray[np.float64 | np.int64]) -> F64:
-        """Sum of bin values, (n,), over each data center, (B,)."""
+        """Return the sum of bin values, (n,), for each data center, (B,)."""
         return np.asarray(np.add.reduceat(values, self.offsets[:-1]), dtype=np.float64)
 
     def running_sums(self, values: F64) -> F64:
-        """Sum of bin values over a bin and those before it in its data center, (n,)."""
+        """Return the cumulative sum of bin values within each data center, (n,)."""
         out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
         for rows in self.by_size:
             out[rows] = np.cumsum(padded[rows], axis=1)
         return out[:-1]
 
     def later_sums(self, values: F64) -> F64:
-        """Sum of bin values over those after a bin in its data center, (n,)."""
+        """Return the sum of values over all later bins of the same data center, (n,)."""
         out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
         for rows in self.by_size:
-            # Summed from the end: a difference from the total would lose small values.
+            # Add from the last bin backwards: total minus cumulative sum would lose small values.
             later = np.cumsum(padded[rows][:, :0:-1], axis=1)[:, ::-1]
             out[rows] = np.append(later, np.zeros((len(rows), 1)), axis=1)
         return out[:-1]
 
     def order(self, key: F64) -> I64:
-        """Bins of each data center by rising key, ties by index, (n,)."""
+        """Return the bins of each data center sorted by ascending key, then by index, (n,)."""
         out, padded = np.empty(len(key) + 1, dtype=np.int64), np.append(key, np.inf)
         for rows in self.by_size:
             by_key = np.argsort(padded[rows], axis=1, kind="stable")
@@ -75,22 +75,22 @@ class Bins:
 
 
 def make_bins(bin_offsets: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Bins:
-    """Arrange the bins of a fleet for ``place``; done once per fleet.
+    """Arrange the bins of a fleet for ``place``; call this function once per fleet.
 
     Args:
-        bin_offsets: First bin of each data center, and the number of bins, (B + 1,); each data
-            center has a bin or more.
-        names: Names of the data centers, for errors; none names them by their numbers.
+        bin_offsets: Index of the first bin of each data center, and the number of bins, (B + 1,);
+            each data center has at least one bin.
+        names: Names of the data centers, for error messages; if empty, their numbers are used.
     """
     offsets = np.asarray(bin_offsets, dtype=np.int64)
     sizes = np.diff(offsets)
-    # One class per power of two: rows are at most half empty, and the classes few.
+    # With one class per power of two, padding is at most half of a row and there are few classes.
     size_class = np.ceil(np.log2(sizes)).astype(np.int64)
     by_size = []
-    for chosen in (np.flatnonzero(size_class == c) for c in np.unique(size_class)):
-        column = np.arange(sizes[chosen].max())
-        inside = column < sizes[chosen, None]
-        by_size.append(np.where(inside, offsets[chosen, None] + column, offsets[-1]))
+    for dcs in (np.flatnonzero(size_class == c) for c in np.unique(size_class)):
+        column = np.arange(sizes[dcs].max())
+        inside = column < sizes[dcs, None]
+        by_size.append(np.where(inside, offsets[dcs, None] + column, offsets[-1]))
     return Bins(
         offsets=offsets,
         dc=np.repeat(np.arange(len(sizes)), sizes),
@@ -110,40 +110,39 @@ def place(
     limit_c: F64,
     weights: F64 | None = None,
 ) -> tuple[F64, F64]:
-    """Spread the utilisation of each data center over its bins.
+    """Distribute the utilisation of each data center over its bins.
 
-    - ``uniform``: the same load everywhere; where that exceeds a bin's capacity, the bins that have
-      room share the rest evenly.
-    - ``fill``: bins in order of their index, each up to its capacity.
-    - ``coolest-first``: bins in order of their inlet temperature, those of equal rank
-      (``air_metrics.rank``) by index, each up to its capacity.
-    - ``inlet-aware``: loads in proportion to the headroom max(limit - inlet, ``MIN_HEADROOM_K``),
-      up to capacity.
-    - ``weights``: loads in proportion to ``weights``, up to capacity; weight 0 gets none, even when
-      the others are full.
+    - ``uniform``: all bins have the same load. Work above the capacity of some bins is distributed
+      evenly over the other bins.
+    - ``fill``: bins are filled to capacity in the order of their index.
+    - ``coolest-first``: bins are filled to capacity in the order of their inlet temperature. Bins
+      of equal rank (``air_metrics.rank``) are filled in the order of their index.
+    - ``inlet-aware``: loads are proportional to the headroom max(limit - inlet,
+      ``MIN_HEADROOM_K``), up to capacity.
+    - ``weights``: loads are proportional to ``weights``, up to capacity. Bins of weight 0 have no
+      load, even if all others are full.
 
-    Loads in proportion and up to capacity are min(capacity, level*weight), with one exact level for
-    a data center: bins are full in the order in which a rising level fills them, as long as the
-    work suffices.
+    Loads proportional to weights are min(capacity, level*weight). The level of a data center is
+    computed exactly, and is such that all work is placed.
 
     Args:
         policy: Name of a policy, see above.
         utilisation: Work as a share of all servers, at least 0, (B,).
         bins: Bins of the fleet, see ``make_bins``.
-        count: Servers of each bin, above 0, (n,).
-        capacity: Utilisation each bin may reach, 0..1, (n,).
+        count: Number of servers of each bin, above 0, (n,).
+        capacity: Highest utilisation of each bin, 0..1, (n,).
         inlet_c: Last known inlet temperature of each bin, C, (n,).
-        limit_c: Inlet temperature that ``inlet-aware`` keeps away from, C, (B,).
-        weights: Relative loads, at least 0 and above 0 for a bin or more of each data center, (n,);
-            for ``weights`` alone.
+        limit_c: Upper limit of the inlet temperature for ``inlet-aware``, C, (B,).
+        weights: Relative loads for policy ``weights``, at least 0, and above 0 for at least one bin
+            of each data center, (n,).
 
     Returns:
-        Load of each bin, 0..capacity, (n,), and the utilisation really placed, (B,):
-        min(utilisation, sum(count*capacity)/sum(count)), the sum of capacities over the bins that
-        may be used. sum(count*load) = placed*sum(count) to rounding.
+        Load of each bin, 0..capacity, (n,), and the utilisation placed, (B,). The latter is
+        min(utilisation, sum(count*capacity)/sum(count)), where the sum of capacities excludes bins
+        of weight 0. Up to rounding errors, sum(count*load) = placed*sum(count).
 
     Raises:
-        PlacementError: weights that are negative, not finite, or all 0 in a data center.
+        PlacementError: Weights are negative, not finite, or all 0 in a data center.
     """
     if policy == "uniform":
         return _uniform(utilisation, bins, count, capacity)
@@ -163,20 +162,20 @@ def place(
 
 
 def _uniform(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64]:
-    """Load of each bin, (n,), and utilisation placed, (B,), the same everywhere if it fits."""
+    """Return equal loads as far as capacity allows, (n,), and the utilisation placed, (B,)."""
     unhindered = utilisation <= np.minimum.reduceat(capacity, bins.offsets[:-1])
     if np.all(unhindered):
         return utilisation[bins.dc], utilisation.copy()
     placed, work, full = _placeable(utilisation, bins, count, capacity)
     load = _in_proportion(np.ones(len(count)), work, bins, count, capacity)
     load = np.where(full[bins.dc], capacity, load)
-    # To the bit what a batch without a limited bin gets.
+    # Unlimited data centers must have exactly the loads that the early return above gives.
     load = np.where(unhindered[bins.dc], utilisation[bins.dc], load)
     return load, np.where(unhindered, utilisation, placed)
 
 
 def _placeable(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64, Mask]:
-    """Utilisation that fits, servers that it keeps busy, and whether it fills all, each (B,)."""
+    """Return utilisation placed, its work in servers, and True if all bins are full, each (B,)."""
     servers = bins.sums(count)
     highest = bins.sums(count * capacity) / servers
     placed = np.minimum(utilisation, highest)
@@ -184,13 +183,13 @@ def _placeable(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple
 
 
 def _fill_in_order(order: I64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
-    """Load of bins that are filled in the given order, (n,)."""
+    """Return the loads of bins that are filled in the given order, (n,)."""
     room = count * capacity
     in_order = bins.running_sums(room[order]) <= work[bins.dc]
     full = np.empty(len(room), dtype=np.bool_)
     full[order] = in_order
     load = np.where(full, capacity, 0.0)
-    # The running sum only tells which bins are full; what is left for the next one is exact.
+    # The cumulative sum determines only which bins are full; the rest is recomputed exactly.
     rest = work - bins.sums(np.where(full, room, 0.0))
     position = bins.offsets[:-1] + np.add.reduceat(in_order.astype(np.int64), bins.offsets[:-1])
     some = position < bins.offsets[1:]
@@ -200,14 +199,14 @@ def _fill_in_order(order: I64, work: F64, bins: Bins, count: F64, capacity: F64)
 
 
 def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
-    """Load min(capacity, level*weight) with the level that places all work, (n,).
+    """Return loads min(capacity, level*weight) with the level that places all work, (n,).
 
-    Where the weight is 0, so is the capacity.
+    Bins of weight 0 must have capacity 0.
     """
     room, weighted = count * capacity, count * weight
     level_full = capacity / np.where(weight > 0.0, weight, 1.0)
     order = bins.order(level_full)
-    # Work done when the level just fills a bin: all before it are full, those after it are not.
+    # Work placed at the level that just fills a bin: earlier bins are full, later ones are not.
     at_level = bins.running_sums(room[order]) + level_full[order] * bins.later_sums(weighted[order])
     full = np.empty(len(room), dtype=np.bool_)
     full[order] = at_level <= work[bins.dc]
@@ -219,19 +218,19 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
 
 
 def _relative_weights(values: F64, bins: Bins) -> F64:
-    """Weights divided by the largest of their data center, (n,)."""
-    wrong = np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))
-    if len(wrong):
-        dc = bins.dc[wrong[0]]
+    """Return weights divided by the largest weight of their data center, (n,)."""
+    invalid = np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))
+    if len(invalid):
+        dc = bins.dc[invalid[0]]
         raise PlacementError(
-            f"{bins.names[dc]}: placement weight {wrong[0] - bins.offsets[dc]} is "
-            f"{values[wrong[0]]}; valid is a finite number of at least 0"
+            f"{bins.names[dc]}: placement weight {invalid[0] - bins.offsets[dc]} is "
+            f"{values[invalid[0]]}; valid is a finite number of at least 0"
         )
     largest = np.maximum.reduceat(values, bins.offsets[:-1])
-    without = np.flatnonzero(largest == 0.0)
-    if len(without):
+    all_zero = np.flatnonzero(largest == 0.0)
+    if len(all_zero):
         raise PlacementError(
-            f"{bins.names[without[0]]}: all placement weights are 0; valid is at least one above 0"
+            f"{bins.names[all_zero[0]]}: all placement weights are 0; valid is at least one above 0"
         )
     relative = values / largest[bins.dc]
     return np.where(values > 0.0, np.maximum(relative, _LEAST_WEIGHT), 0.0)

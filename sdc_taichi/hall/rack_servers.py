@@ -1,4 +1,4 @@
-"""Server groups of the racks of a hall as flat arrays, divided at the height zones of the air."""
+"""Server groups of the racks of a hall as flat arrays, split at the boundaries of height zones."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from sdc_taichi.types import F64, I32
 
 
 class AirProperties(NamedTuple):
-    """Air of a hall, whose airflows are volume flows at REFERENCE_C and the site's pressure."""
+    """Properties of a hall's air; airflows are volume flows at REFERENCE_C and site pressure."""
 
     density_kg_m3: float
     """Density at REFERENCE_C, in kg/m3."""
     j_per_m3_k: float
-    """Heat capacity by volume at REFERENCE_C, rho cp, in J/(m3 K)."""
+    """Volumetric heat capacity rho cp at REFERENCE_C, in J/(m3 K)."""
     density_ratio: DensityRatio
-    """Density divided by that at REFERENCE_C against temperature."""
+    """Density divided by its value at REFERENCE_C, as a function of temperature."""
 
 
 def air_properties(config: DataCenterConfig) -> AirProperties:
-    """Density and heat capacity of the air of a hall.
+    """Return density and heat capacity of the air of a hall.
 
-    A density of the config holds at all temperatures; without one it follows from the height of the
-    site above sea level and the temperature.
+    A configured density applies at all temperatures. Without one, the density follows from the
+    height of the site above sea level and from the temperature.
 
     Raises:
-        DataError: a site or weather file that names no height.
+        DataError: The site or weather file does not state the height above sea level.
     """
     hall, site = config.hall, config.site
     configured = hall.air_density_kg_m3
@@ -44,55 +44,55 @@ def air_properties(config: DataCenterConfig) -> AirProperties:
 
 @dataclass(frozen=True, slots=True)
 class RackServers:
-    """Server groups of a hall of R racks and G groups, cut at the height zones, and their air.
+    """Servers of a hall of R racks in G groups, split at height zones, and their air.
 
-    The servers of a group are alike and meet the same air.
+    All servers of a group are identical and take in air of the same temperature.
     """
 
     group_offsets: I32
-    """First group of each rack, and the number of groups, (R + 1,)."""
+    """Index of the first group of each rack, and the number of groups, (R + 1,)."""
     count: F64
-    """Servers of each group, (G,)."""
+    """Number of servers of each group, (G,)."""
     full_w: F64
-    """CPU power of one server at full load and a power ratio of 1, in W, (G,)."""
+    """CPU power of one server at full load where its power curve has the value 1, in W, (G,)."""
     idle_w: F64
     """Lowest CPU power of one server, in W, (G,)."""
     inlet_offset_k: F64
-    """Inlet of each group over the inlet of its rack, in K, (G,)."""
+    """Configured inlet temperature of each group minus that of its rack, in K, (G,)."""
     load_deviation: F64
-    """Load weight of each group over the mean of its rack, less 1, (G,)."""
+    """Load weight of each group divided by the mean of its rack, minus 1, (G,)."""
     full_airflow_m3s: F64
-    """Airflow of one server at airflow ratio 1 as configured, in m3/s; nan where it follows from
-    the design point, (G,)."""
+    """Configured airflow of one server at an airflow ratio of 1, in m3/s, (G,); NaN where it
+    follows from the design point."""
     design_rise_k: F64
-    """Temperature rise of the air through one server at the design point as configured, in K; nan
-    where none is, (G,)."""
+    """Configured temperature rise of the air through one server at the design point, in K, (G,);
+    NaN where none is configured."""
     fan_reference_w: F64
     """Fan power of one server at the reference airflow ratio, in W, (G,)."""
     height_factor: F64
-    """Exhaust share of the intake of each group divided by that of its rack, by height, (G,). Its
-    mean over the airflow of a rack is near 1."""
+    """Share of exhaust air in the intake of each group divided by that of its rack, (G,). It
+    depends on height, and its airflow-weighted mean in a rack is close to 1."""
     air: AirProperties
-    """Air that the servers take in."""
+    """Properties of the air that the servers take in."""
 
     def per_rack(self, values: F64) -> F64:
-        """Sum of group values, (G,), over each rack, (R,)."""
+        """Return the sum of group values, (G,), for each rack, (R,)."""
         return np.add.reduceat(values, self.group_offsets[:-1])
 
     def per_group(self, values: F64) -> F64:
-        """Rack values, (R,), repeated for each group, (G,)."""
+        """Return the value of each group's rack, (G,), from rack values, (R,)."""
         return np.repeat(values, np.diff(self.group_offsets))
 
 
 def rack_servers(config: DataCenterConfig) -> RackServers:
-    """Server groups of every rack of a hall.
+    """Return the server groups of every rack of a hall.
 
-    Servers fill a rack from the floor in the order in which its groups are listed. With inlet model
-    ``recirculation`` groups are cut at the height zones.
+    Servers fill a rack from the floor up, in the order in which the configuration lists its groups.
+    With inlet model ``recirculation``, groups are split at the boundaries of height zones.
 
     Raises:
-        ConfigError: a capacity that leaves racks without servers.
-        DataError: a site or weather file that names no height above sea level.
+        ConfigError: The capacity leaves racks without servers.
+        DataError: The site or weather file does not state the height above sea level.
     """
     hall = config.hall
     zones = hall.height_zones if hall.inlet_model == "recirculation" else 1
@@ -123,7 +123,10 @@ def rack_servers(config: DataCenterConfig) -> RackServers:
 
 
 def _values(group: ServerGroup, servers: ServerConfig) -> tuple[float | None, ...]:
-    """Numbers of a group as ``_rack_columns`` takes them; None becomes nan."""
+    """Return the properties of a group in the order that ``_rack_columns`` requires.
+
+    A value of None stands for a property that is not configured.
+    """
     airflow_m3s = group.full_airflow_m3s
     if airflow_m3s is None and group.design_rise_k is None:
         airflow_m3s = servers.fan_full_airflow_m3s
@@ -138,23 +141,23 @@ def _values(group: ServerGroup, servers: ServerConfig) -> tuple[float | None, ..
 
 
 def _rack_columns(groups: F64, zones: int) -> F64:
-    """Groups of one rack, cut at its height zones, (9, cut groups).
+    """Split the groups of one rack at its height zones, (9, number of groups after the split).
 
     Args:
-        groups: count, full power, idle power, load weight, inlet offset, full airflow, design rise,
-            fan power and height of a server, (groups, 9).
-        zones: height zones of the rack.
+        groups: Properties of the groups, (groups, 9): count, full power, idle power, load weight,
+            inlet offset, full airflow, design rise, fan power, and height of a server.
+        zones: Number of height zones of the rack.
 
     Returns:
-        Rows count, full power, idle power, load deviation, inlet offset, full airflow, design rise,
-        fan power, and level from -1 at the floor to 1 at the top.
+        Rows with count, full power, idle power, load deviation, inlet offset, full airflow, design
+        rise, fan power, and level, which is -1 at the floor and 1 at the top of the rack.
     """
     count, weight, height_u = groups[:, 0], groups[:, 3], groups[:, 8]
     listed = groups.T[:8].copy()
     listed[3] = weight / (np.sum(count * weight) / np.sum(count)) - 1.0
     servers = int(count.sum())
     zones = min(zones, servers)
-    # The servers below the upper end of each zone.
+    # Compute the number of servers below the upper end of each zone.
     tops_u = np.concatenate([[0.0], np.cumsum(count * height_u)])
     numbers = np.concatenate([[0.0], np.cumsum(count)])
     zone_ends = np.rint(np.interp(np.arange(1, zones + 1) * tops_u[-1] / zones, tops_u, numbers))

@@ -1,15 +1,16 @@
 """Heat recirculation: the share of each rack's exhaust in the intake of each rack.
 
-With R_ji the share of rack j's intake that is rack i's exhaust,
+R_ji is the share of rack i's exhaust in the intake of rack j, r_j is the share of all exhaust air
+in the intake of rack j, and w_ji are weights:
 
     T_in,j = (1 - r_j) T_sup + sum_i R_ji T_out,i,    R_ji = r_j w_ji,  sum_i w_ji = 1
 
 (Tang, Gupta and Varsamopoulos 2008, *Energy-efficient thermal-aware task scheduling for homogeneous
-high-performance computing data centers*, IEEE TPDS 19(11)). The weights w are those of the exhaust
-mix before each rack (``mix_weights``) or of a user's matrix (``matrix_file``); the shares r are
-such that the configured approach temperatures hold exactly at the design point: of every rack, or
-as means of the rows or of the hall. Racks within a row or hall then differ by their exposure
-(``exposure``) or by the matrix.
+high-performance computing data centers*, IEEE TPDS 19(11)). The weights w follow from the layout
+(``mix_weights``) or from a matrix file (``matrix_file``). The shares r are such that the configured
+approach temperatures (inlet minus supply) hold exactly at the design point, either for every rack
+or as means of the rows or of the hall. With means, the racks of a row or hall differ by their
+exposure (``exposure``) or by the matrix.
 """
 
 from __future__ import annotations
@@ -33,27 +34,27 @@ Result = TypeVar("Result")
 
 _MOST_ITERATIONS = 500
 _WITHIN_K = 1e-12
-"""Change of the approach temperatures, in K, below which iteration ends."""
+"""Tolerance of the iteration for approach temperatures, in K."""
 _MOST_MEAN_SHARE = 0.9
-"""Largest share of the exhaust mix in the mean intake of a row or hall; beyond it, hardly any
-supply air reaches the racks."""
+"""Largest mean share of exhaust air in the intake of a row or hall; at larger shares, hardly any
+supply air would reach the racks."""
 _MOST_NEWTON_STEPS = 50
 _EXACT_RACKS, _LARGE_WITHIN_K = 10_000, 1e-3
-"""Most racks of a hall whose approach temperatures are computed to ``_WITHIN_K`` if their means are
-configured, and the change in K that ends iteration in larger halls: each iteration leaves a
-twentieth of the change, and takes a second in a hall of a hundred thousand racks."""
+"""Largest number of racks for which the tolerance is ``_WITHIN_K`` if means of the approach
+temperatures are configured, and the tolerance in K for larger halls. An iteration reduces the
+change by a factor of 20 and takes a second in a hall of 100,000 racks."""
 _CONTAINED_WITHIN_K = 1e-9
-"""Change of the exhaust mixes of a contained hall, in K, below which iteration ends."""
+"""Tolerance of the iteration for the exhaust mixes of a hall with containment, in K."""
 
 
 OVER_M = 2.3
-"""Length of the range at the end of a row where less exhaust comes over the racks."""
+"""Length, in m, of the zone at a row's end where less exhaust air comes over the racks."""
 NEIGHBOURS_M = 2.2
-"""Length over which racks of an aisle share its supply air."""
+"""Decay length of the weights by which racks share the supply air of their aisle, in m."""
 LEAST = 0.15
-"""Exposure of a rack for which the sum of the terms is 0; a rack of the mean has about 1."""
+"""Exposure of a rack for which the sum of the terms is 0; the mean exposure is about 1."""
 _REACH = 40.0
-"""Distance of the farthest neighbours that count, in lengths: their weight is a rounding error."""
+"""Distance beyond which the weights of neighbours are neglected, in decay lengths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,38 +62,40 @@ class Recirculation:
     """Calibrated recirculation of a hall of R racks and G server groups."""
 
     mix_weights: MixWeights
-    """Weights w of the exhaust mix before each rack."""
+    """Weights w of the exhaust mix of each rack."""
     exhaust_share: F64
-    """Share r of each rack's intake that is exhaust air, with containment, 0..1, (R,)."""
+    """Share r of exhaust air in the intake of each rack, with containment, 0..1, (R,)."""
     group_exhaust_share: F64
-    """Share of each server group's intake that is exhaust air, by its height, 0..1, (G,)."""
+    """Share of exhaust air in the intake of each server group, which depends on its height, 0..1,
+    (G,)."""
     fresh_share: float
-    """Share of CRAC air that reaches inlets at the design point; the rest bypasses them."""
+    """Share of CRAC air that reaches rack inlets at the design point; the rest bypasses them."""
     need_m3s: F64
     """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
     design: DesignPoint
-    """Design point of the hall, with containment; ``height_factor`` is that of the open hall."""
+    """Design point of the hall with containment, but ``height_factor`` without containment."""
 
     def matrix(self) -> F64:
-        """R, the share of each rack's intake (rows) that is each rack's exhaust, (R, R)."""
+        """Return the share of rack i's exhaust in the intake of rack j as entry [j, i], (R, R)."""
         return np.asarray(self.exhaust_share[:, None] * self.mix_weights.dense())
 
 
 def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> Recirculation:
-    """Recirculation of a hall, from its layout or from a matrix of the user's.
+    """Calibrate the recirculation of a hall, from its layout or from a matrix file.
 
-    r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, less the share that containment
-    closes; the approach temperatures a are those of the open hall, dT is the rise through a rack.
-    If only their means are configured, r_j = k e_j / (1 + k e_j): exhaust and supply air share the
-    intake as k times the exposure e_j to 1, with the k of the row or of the hall.
+    The exhaust share of rack j is r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, with the
+    approach temperatures a without containment and the temperature rises dT through the racks. If
+    only means of the approach temperatures are configured, r_j = k e_j / (1 + k e_j): the ratio of
+    exhaust to supply air is the exposure e_j times a factor k, which is equal for all racks of the
+    row or hall. Containment reduces the exhaust shares.
 
     Args:
         config: A data center with inlet model ``recirculation``.
-        servers: Its ``rack_servers``; None computes them.
+        servers: Servers of the hall, see ``rack_servers``; None computes them.
 
     Raises:
-        ConfigError: a matrix that cannot be read or is no recirculation matrix, or approach
-            temperatures that the airflows cannot close on.
+        ConfigError: The matrix file is invalid, or no recirculation gives the approach temperatures
+            with the configured airflows.
     """
     servers = rack_servers(config) if servers is None else servers
     design = design_point(config, servers)
@@ -100,7 +103,7 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
     try:
         return _calibrated(config, servers, design)
     except ConfigError as error:
-        # A hall that is valid without its matrix is invalid because of it.
+        # The design point above is valid, so the error is due to the matrix file, if there is one.
         named = path is None or str(path) in str(error)
         raise ConfigError(str(error) if named else f"{path}: {error}") from None
 
@@ -108,10 +111,10 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
 def _calibrated(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> Recirculation:
-    """Recirculation of a hall that has a design point without it.
+    """Calibrate the recirculation from a design point without recirculation.
 
-    Containment c closes the share c of the paths both ways: racks take in r (1 - c) of exhaust air,
-    and b (1 - c) of the supply air bypasses them. The units are sized for the remaining airflows.
+    Containment c reduces both paths by the factor 1 - c: the exhaust share r of the racks and the
+    share of supply air that bypasses them. The CRAC airflow is sized for the resulting airflows.
     """
     if config.hall.recirculation.matrix_file is None:
         weights, open_share, design = _from_layout(config, servers, design)
@@ -126,7 +129,7 @@ def _calibrated(
     if open_part < 1.0:
         fresh = 1.0 - (1.0 - fresh) * open_part
         design = _contained_design(config, servers, design, weights, group_share)
-    # Inlets are warmed by the exhaust that they take in.
+    # The exhaust share of an intake is its approach temperature divided by its exhaust mix.
     need_m3s = design.airflow_m3s * (1.0 - design.approach_k / weights.apply(design.outlet_rise_k))
     if open_part < 1.0:
         design = replace(design, crac_flow_m3s=float(need_m3s.sum()) / fresh)
@@ -136,7 +139,7 @@ def _calibrated(
 def _from_layout(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> tuple[MixWeights, F64, DesignPoint]:
-    """Weights, exhaust shares and design point of the open hall by its layout."""
+    """Return weights, exhaust shares and design point from the layout, without containment."""
     if config.hall.recirculation.scaled_to == "rack":
         weights = layout_weights(config.hall, design.airflow_m3s)
         return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
@@ -150,7 +153,7 @@ def _from_layout(
 def _from_matrix_file(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> tuple[MixWeights, F64, DesignPoint]:
-    """Weights, exhaust shares and design point by a user's R or D."""
+    """Return weights, exhaust shares and design point from a matrix file, without containment."""
     settings = config.hall.recirculation
     path = Path(settings.matrix_file or "")
     kind, values = read_matrix(config, path)
@@ -160,8 +163,8 @@ def _from_matrix_file(
         design = _solve_design_point(config, servers, lambda at: values @ at.it_w)
     matrix = share_matrix(config, path, kind, values, design)
     sums = matrix.sum(axis=1)
-    none = sums == 0
-    wanted_k = design.approach_k * none
+    no_exhaust = sums == 0
+    wanted_k = design.approach_k * no_exhaust
     if settings.scaled_to == "rack" and np.any(wanted_k > 0):
         rack = int(np.argmax(wanted_k))
         raise ConfigError(
@@ -169,10 +172,9 @@ def _from_matrix_file(
             f"{wanted_k[rack]:g} K of hall.supply_approach_k; valid is 0 K there or "
             "another hall.recirculation.calibrate than rack"
         )
-    # A rack that takes in supply air alone also has a mix before it: that of all racks.
-    weights = dense_weights(
-        np.where(none[:, None], 1.0 / len(sums), matrix / np.where(none, 1.0, sums)[:, None])
-    )
+    # Weights must sum to 1 even for racks without exhaust air, which therefore use equal weights.
+    row_sums = np.where(no_exhaust, 1.0, sums)[:, None]
+    weights = dense_weights(np.where(no_exhaust[:, None], 1.0 / len(sums), matrix / row_sums))
     if settings.scaled_to == "rack":
         return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
     if settings.scaled_to != "none":
@@ -182,12 +184,12 @@ def _from_matrix_file(
 
 
 def _parts(config: DataCenterConfig) -> int:
-    """Number of equal parts of a hall whose mean approach temperatures hold: its rows, or 1."""
+    """Return the number of equal parts of the hall for which means are configured: rows, or 1."""
     return config.hall.rows if config.hall.recirculation.scaled_to == "row" else 1
 
 
 def _mean_approach_k(config: DataCenterConfig) -> F64:
-    """Approach temperatures of the config, plain means over the rows or over the hall, K, (R,)."""
+    """Return the means of the configured approach temperatures by row or hall, in K, (R,)."""
     hall, parts = config.hall, _parts(config)
     means = hall.rack_approach_k().reshape(parts, -1).mean(axis=1)
     return np.repeat(means, hall.racks // parts)
@@ -196,16 +198,16 @@ def _mean_approach_k(config: DataCenterConfig) -> F64:
 def _shares_by_exposure(
     config: DataCenterConfig, servers: RackServers, weights: MixWeights, exposed: F64
 ) -> tuple[F64, DesignPoint]:
-    """Exhaust shares whose approach temperatures have the given means, and the design point.
+    """Return exhaust shares that give the configured mean approaches, and the design point.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        weights: Weights of the exhaust mix before each rack.
+        servers: Servers of the hall, see ``rack_servers``.
+        weights: Weights of the exhaust mix of each rack.
         exposed: Exposure of each rack, 0 or more, (R,).
 
     Raises:
-        ConfigError: means that exhaust air cannot bring about, or no steady state.
+        ConfigError: The means are too large for the exhaust air, or the iteration fails.
     """
     wanted_k = _mean_approach_k(config)
 
@@ -220,29 +222,30 @@ def _shares_by_exposure(
 
 
 def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F64) -> F64:
-    """Exhaust shares k e / (1 + k e) with the k of each part that gives the wanted means, (R,).
+    """Return exhaust shares k e / (1 + k e) that give the wanted mean approaches, (R,).
 
-    The mean rises ever less with k, so that Newton's steps from 0 come near it from below.
+    Each part (row or hall) has its own k. The mean is a concave, rising function of k, so Newton's
+    method from k = 0 converges from below.
     """
     hall, parts = config.hall, _parts(config)
     mix, e, wanted = (values.reshape(parts, -1) for values in (mix_k, exposed, wanted_k))
     goal = wanted[:, 0]
-    most = np.mean(mix * (e > 0), axis=1)
-    if np.any(goal > _MOST_MEAN_SHARE * most):
-        part = int(np.argmax(goal - _MOST_MEAN_SHARE * most))
+    mean_mix = np.mean(mix * (e > 0), axis=1)
+    if np.any(goal > _MOST_MEAN_SHARE * mean_mix):
+        part = int(np.argmax(goal - _MOST_MEAN_SHARE * mean_mix))
         where = f" of row {part}" if hall.recirculation.scaled_to == "row" else ""
         raise ConfigError(
             f"{hall.recirculation.matrix_file or config.name}: hall.supply_approach_k{where} is "
             f"{goal[part]:.3g} K on the mean, but the exhaust that its racks take in is "
-            f"{most[part]:.3g} K above supply air on the mean; valid is at most "
+            f"{mean_mix[part]:.3g} K above supply air on the mean; valid is at most "
             f"{100 * _MOST_MEAN_SHARE:g} % of that"
         )
     k = np.zeros(parts)
     for _ in range(_MOST_NEWTON_STEPS):
         odds = k[:, None] * e
-        lacking = goal - np.mean(mix * odds / (1.0 + odds), axis=1)
+        residual = goal - np.mean(mix * odds / (1.0 + odds), axis=1)
         slope = np.mean(mix * e / (1.0 + odds) ** 2, axis=1)
-        step = lacking / np.where(slope > 0, slope, 1.0)
+        step = residual / np.where(slope > 0, slope, 1.0)
         k = k + step
         if np.all(np.abs(step) <= 1e-14 * k):
             break
@@ -255,17 +258,18 @@ def _solve_design_point(
     servers: RackServers,
     approach_k: Callable[[DesignPoint], F64],
 ) -> DesignPoint:
-    """Design point whose approach temperatures are those that follow from it.
+    """Find the design point that is consistent with its own approach temperatures.
 
-    Power and airflow depend on the inlets, which depend on the outlets that power and airflow make.
+    Power and airflow depend on the inlets, and the inlets depend on the outlets, which follow from
+    power and airflow. Fixed-point iteration resolves this dependence.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        approach_k: Inlet above supply air, K, (R,), that follows from a design point.
+        servers: Servers of the hall, see ``rack_servers``.
+        approach_k: Function from a design point to inlet minus supply temperatures, K, (R,).
 
     Raises:
-        ConfigError: no steady state.
+        ConfigError: The iteration does not converge.
     """
 
     def update(before_k: F64) -> tuple[F64, DesignPoint]:
@@ -282,17 +286,17 @@ def _contained_design(
     weights: MixWeights,
     group_share: F64,
 ) -> DesignPoint:
-    """Design point behind containment, but for the airflow of the CRAC units.
+    """Compute the design point with containment, except for the airflow of the CRAC units.
 
     Args:
         config: The data center.
-        servers: Its ``rack_servers``.
-        design: Design point of the open hall.
-        weights: Weights of the exhaust mix before each rack.
-        group_share: Share of each group's intake that is exhaust air, with containment, (G,).
+        servers: Servers of the hall, see ``rack_servers``.
+        design: Design point without containment.
+        weights: Weights of the exhaust mix of each rack.
+        group_share: Share of exhaust air in each group's intake, with containment, (G,).
 
     Raises:
-        ConfigError: no steady state.
+        ConfigError: The iteration does not converge.
     """
 
     def update(mix_k: F64) -> tuple[F64, DesignPoint]:
@@ -318,16 +322,16 @@ def _settled(
 
     Args:
         config: The data center, for the error.
-        start_k: Temperatures above supply air that the first update takes, K, (R,).
-        update: Temperatures that follow from those before, K, (R,), and the result that goes with
-            them.
-        within_k: Change at which the temperatures count as steady, K.
+        start_k: Temperatures minus supply temperature for the first update, K, (R,).
+        update: Function from previous temperatures to new temperatures, K, (R,), and a result that
+            belongs to the new temperatures.
+        within_k: Change below which the iteration ends, K.
 
     Returns:
         Result of the last update.
 
     Raises:
-        ConfigError: no steady state.
+        ConfigError: The iteration does not converge.
     """
     before_k = start_k
     for _ in range(_MOST_ITERATIONS):
@@ -342,7 +346,7 @@ def _settled(
 
 
 def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: F64) -> None:
-    """Check that exhaust air is less than the whole intake of every server."""
+    """Raise an error unless the share of exhaust air in every server's intake is below 1."""
     worst = int(np.argmax(group_share))
     if group_share[worst] >= 1.0:
         rack = int(np.searchsorted(servers.group_offsets, worst, side="right")) - 1
@@ -356,7 +360,7 @@ def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: 
 def _check_airflows(
     config: DataCenterConfig, design: DesignPoint, weights: MixWeights, share: F64
 ) -> None:
-    """Check that racks together take in no more of an exhaust than there is."""
+    """Raise an error if all racks together take in more exhaust air of a rack than it emits."""
     left = design.airflow_m3s - weights.apply_transposed(share * design.airflow_m3s)
     worst = int(np.argmin(left))
     if left[worst] < 0:
@@ -368,10 +372,10 @@ def _check_airflows(
 
 
 def _open_fresh_share(config: DataCenterConfig, design: DesignPoint, share: F64) -> float:
-    """Share of the CRAC air that the racks of the open hall take in, at most 1.
+    """Return the share of the CRAC air that racks take in without containment, at most 1.
 
     Raises:
-        ConfigError: CRAC units that do not give the air that the racks take in.
+        ConfigError: The CRAC units supply less air than the racks take in.
     """
     need_m3s = float(np.sum((1.0 - share) * design.airflow_m3s))
     if need_m3s > design.crac_flow_m3s * (1 + 1e-9):
@@ -385,20 +389,22 @@ def _open_fresh_share(config: DataCenterConfig, design: DesignPoint, share: F64)
 
 @dataclass(frozen=True, slots=True)
 class _Coefficients:
-    """Coefficients of the exposure for one place of the returns."""
+    """Coefficients of the exposure of racks for one position of the return air openings."""
 
     around: float
-    """Exposure at the very end of a row to air that comes round it."""
+    """Additional exposure at the end of a row due to air that flows around this end."""
     around_length_m: float
-    """Length over which air that comes round the end of a row fades, in m."""
+    """Decay length of the exposure to air that flows around the end of a row, in m."""
     around_closed: float
-    """Share of ``around`` that full containment takes away beyond what it takes from all paths."""
+    """Relative reduction of ``around`` by full containment, in addition to its general effect on
+    all paths."""
     over: float
-    """Reduction of the exposure at the very end of a row to air that comes over the racks."""
+    """Reduction of exposure at the end of a row, where less air flows over the racks."""
     over_closed: float
-    """Share of ``over`` that full containment takes away beyond what it takes from all paths."""
+    """Relative reduction of ``over`` by full containment, in addition to its general effect on all
+    paths."""
     demand: float
-    """Change of the exposure divided by that of the demand for air, relative to its mean."""
+    """Change of the exposure divided by the relative change of the aisle's local air demand."""
 
 
 _BY_RETURNS = {
@@ -408,22 +414,22 @@ _BY_RETURNS = {
 
 
 def exposure(hall: HallConfig, airflow_m3s: F64) -> F64:
-    """Exposure of every rack to exhaust air, relative to the other racks of its row, above 0, (R,).
+    """Return the relative exposure of every rack to exhaust air, above 0, (R,).
 
-    Air comes to an inlet round the ends of the rows and over the racks, and the more of it the more
-    a rack and its neighbours draw than the floor gives them. The exposure of rack j, whose
-    distances to the ends of its row are x,
+    Exhaust air reaches an inlet around the ends of the rows and over the racks. Its amount rises
+    with the airflow that a rack and its neighbours draw in excess of the local floor supply. The
+    exposure of rack j, with distances x to the ends of its row, is
 
         e_j = 1 + around sum_ends exp(-x / around_length) - over sum_ends exp(-x / OVER_M)
                 + demand (v_j - 1)
 
-    with v_j the airflow of the racks that face the aisle around j (weights exp(-distance /
-    NEIGHBOURS_M)) over the mean of the aisle, kept above 0. Coefficients are fitted to the inlets
-    that ``sdc-taichi hall solve`` finds for 63 halls of 8 to 200 racks; docs/hall.md shows how
-    well.
+    and is bounded to stay above 0. Here v_j is a weighted mean airflow of the racks that face the
+    aisle near rack j, with weights exp(-distance / NEIGHBOURS_M), divided by the mean of the aisle.
+    The coefficients are fitted to the inlet temperatures that ``sdc-taichi hall solve`` computes
+    for 63 halls of 8 to 200 racks; docs/hall.md shows the quality of the fit.
 
     Args:
-        hall: Rows, measures, returns and containment.
+        hall: Configuration of the hall.
         airflow_m3s: Airflow of each rack at the design point, m3/s, (R,).
     """
     values, closed = _BY_RETURNS[hall.layout.returns], hall.layout.containment
@@ -435,25 +441,25 @@ def exposure(hall: HallConfig, airflow_m3s: F64) -> F64:
     ends -= over * _from_ends(along, OVER_M)
     demand = _demand(hall, airflow_m3s.reshape(hall.rows, hall.racks_per_row))
     raw = 1.0 + ends + values.demand * (demand - 1.0)
-    # Above 0 and in the same order, where the floor gives more than the racks draw.
+    # This smooth, monotonic function keeps the exposure above 0 even if ``raw`` is negative.
     return np.asarray(raw + np.hypot(raw, 2.0 * LEAST)).reshape(-1) / 2.0
 
 
 def _from_ends(along_m: F64, length_m: float) -> F64:
-    """Sum over both ends of a row of exp(-distance / length), (P,)."""
+    """Return the sum of exp(-distance / length) over both ends of a row, for P racks, (P,)."""
     from_first: F64 = np.exp(-along_m / length_m)
     return np.asarray(from_first + from_first[::-1], dtype=np.float64)
 
 
 def _demand(hall: HallConfig, airflow_m3s: F64) -> F64:
-    """Airflow drawn from the aisle around each rack over the mean of the aisle, (rows, P).
+    """Return the airflow drawn near each rack divided by the mean of its aisle, (rows, P).
 
     Args:
-        hall: Gives the distance of the racks.
+        hall: Configuration of the hall, with the pitch of the P racks in a row.
         airflow_m3s: Airflow of each rack, m3/s, (rows, P).
     """
     rows, per_row = airflow_m3s.shape
-    # Rows 0 and 1 face each other, and so on; the last of an odd number faces the wall.
+    # Rows 0 and 1 face the same aisle, and so on; if their number is odd, the last faces a wall.
     drawn = np.add.reduceat(airflow_m3s, np.arange(0, rows, 2), axis=0)
     drawn = drawn / drawn.mean(axis=1, keepdims=True)
     pitches = NEIGHBOURS_M / hall.layout.rack_pitch_m
@@ -464,7 +470,7 @@ def _demand(hall: HallConfig, airflow_m3s: F64) -> F64:
         return np.asarray(np.convolve(values, weights)[reach : reach + per_row])
 
     whole = smoothed(np.ones(per_row))
-    # Most aisles of a hall are equal.
+    # Compute equal aisles, which are most aisles of a hall, only once.
     distinct, aisle = np.unique(drawn, axis=0, return_inverse=True)
     around = np.stack([smoothed(values) / whole for values in distinct])
     return np.asarray(np.repeat(around[aisle.reshape(-1)], 2, axis=0)[:rows])

@@ -166,7 +166,7 @@ class ChillerModel:
 
 
 def centrifugal_vsd(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step a water-cooled, variable-speed centrifugal chiller, fitted to a 1442 kW Trane CVHE.
+    """Water-cooled centrifugal chiller with variable speed, fitted to a Trane CVHE of 1442 kW.
 
     COP = c * Te / (max(Tc - Te, min_lift_k) + 22 K), with the temperatures of leaving chilled water
     Te and entering condenser water Tc in kelvin. The constant c is chosen so that the COP is
@@ -191,7 +191,7 @@ def centrifugal_vsd(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def carnot(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step a chiller of constant Carnot effectiveness with the part-load curve of the York chiller.
+    """Constant Carnot effectiveness with the part-load curve of a York YT chiller.
 
     COP = eta * Te / max(Tc - Te, min_lift_k), with the temperatures of leaving chilled water Te and
     entering condenser water Tc in kelvin. The effectiveness eta is chosen so that the COP is
@@ -212,7 +212,7 @@ def carnot(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step a York YT centrifugal chiller with its Chiller:Electric:EIR curves.
+    """York YT centrifugal chiller with its Chiller:Electric:EIR curves.
 
     The available capacity is Q_avail = Q_ref*CapFT and the power is
     P = Q_avail/COP_ref*EIRFT*EIRFPLR*min(1, PLR/min_plr)
@@ -229,7 +229,7 @@ def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step a water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
+    """Water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
 
     The coefficients are those of the EnergyPlus unit test ChillerElectric, whose nominal COP is
     4.75.
@@ -247,7 +247,7 @@ def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def electric_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step an air-cooled Chiller:Electric, whose condenser takes air at the outdoor dry bulb.
+    """Air-cooled Chiller:Electric, whose condenser takes in air at the outdoor dry bulb.
 
     The coefficients are those of the EnergyPlus test file AirCooledElectricChiller.idf.
     """
@@ -264,7 +264,7 @@ def electric_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def constant_cop(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step a chiller whose COP is constant up to its capacity (EnergyPlus Chiller:ConstantCOP)."""
+    """Constant COP up to the capacity (EnergyPlus Engineering Reference, Chiller:ConstantCOP)."""
     load = np.maximum(load_w, 0.0)
     evaporator_w = np.minimum(load, point.reference_w)
     power_w = evaporator_w / point.machine.reference_cop
@@ -274,7 +274,7 @@ def constant_cop(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def released(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step the chiller of the released SustainDC code: Chiller:Electric with three departures.
+    """Chiller of the released SustainDC code: Chiller:Electric with three departures.
 
     First, the temperature difference from design is (T_amb - 35)/2.778 - (6.67 - 35), which ignores
     the chilled-water temperature and is 28.33 K too large. Second, the last capacity coefficient is
@@ -295,7 +295,7 @@ def released(load_w: Values, point: ChillerPoint) -> ChillerResult:
 
 
 def paper(load_w: Values, point: ChillerPoint) -> ChillerResult:
-    """Step the chiller of the paper (appendix A.2.2): power P_chiller = P_cool*(1 + 1/COP).
+    """Chiller of the SustainDC paper (appendix A.2.2): power P_chiller = P_cool*(1 + 1/COP).
 
     This expression is the heat that a condenser rejects, but the paper adds it to the HVAC power
     and also passes it to the tower. The paper states no capacity, so the load is not limited.
