@@ -1,5 +1,5 @@
-"""Runs: a simulator under a controller for many steps, their metrics, and the run folder.
+"""Runs of a simulator under a controller, their metrics, and the files of run folders.
 
-The files of a run folder are defined here, written by ``folder_writer`` and read by
-``folder_reader``. No physics, no controller and no picture lives here.
+``folder_writer`` writes run folders and ``folder_reader`` reads them. The package contains no
+physics, no controllers and no plots.
 """

@@ -1,8 +1,9 @@
-"""Share of the achievable: how much of a known optimum's saving over idle commands a run reaches.
+"""Share of the achievable: saving of a run relative to the saving of a known optimum.
 
-The share of the achievable is 0 for a controller that does as well as idle commands, and 1 for one
-that does as well as the optimum's achieved path. Energy stored and work that waits at the end are
-valued, so that an empty battery is no saving (``Optimum.end_value``).
+Both savings are relative to idle commands. The share is 0 for a controller that is as good as idle
+commands, and 1 for a controller that is as good as the optimum's achieved path. Stored energy and
+queued work at the end of the run are valued (``Optimum.end_value``), so that emptying the battery
+does not count as a saving.
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ OPTIMUM = "optimum"
 
 
 class AchievedPath:
-    """A controller that gives the commands of the achieved path of a known optimum.
+    """Controller that repeats the commands of the achieved path of a known optimum.
 
     Args:
-        optimum: the optimum, of the data centers that it is to control.
+        optimum: The optimum, solved for the controlled data centers.
     """
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum = optimum
 
     def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
+        """Do nothing, because the controller has no state."""
 
     def act(self, view: View) -> Actions:
-        """Commands of the step to come."""
+        """Return the commands of the next step."""
         step, of = view.state.step, self._optimum
         if step >= of.steps:
             raise SdcError(f"step {step} of an optimum of {of.steps} steps")
@@ -51,30 +52,30 @@ class AchievedPath:
 
 @dataclass(frozen=True, slots=True)
 class Achievement:
-    """Score of a controller compared with a known optimum, of B data centers."""
+    """Score of a controller on B data centers, compared with a known optimum."""
 
     controller: str
     """Name of the controller."""
     figure: F64
-    """Figure of the scored steps, in the unit of the objective, (B,)."""
+    """Objective value of the scored steps, in the unit of the objective, (B,)."""
     valued_figure: F64
-    """Figure less the value of what is stored and less what waits at the end, (B,); nan where that
-    has no value."""
+    """``figure`` minus the value of stored energy and queued work at the end, (B,); nan if these
+    cannot be valued."""
     share: F64
-    """Share of the achievable, (B,); nan where there is none."""
+    """Share of the achievable, (B,); nan if the optimum saves nothing."""
     total_share: float
-    """Share of the achievable of all data centers together; nan where there is none."""
+    """Share of the achievable of all data centers together; nan if the optimum saves nothing."""
     broken: tuple[tuple[str, ...], ...]
-    """Constraints that each data center broke and the achieved path did not, in words."""
+    """Texts on the constraints that each data center violated and the achieved path did not."""
 
 
 def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
     """Compare the score of a run with a known optimum.
 
     Args:
-        optimum: known optimum of the same configs, inputs and steps.
-        controller: name of the controller.
-        score: score of the run, under the objective and from the first scored step of the optimum.
+        optimum: Known optimum of the same configs, inputs and steps.
+        controller: Name of the controller.
+        score: Score of the run, with the objective and the first scored step of the optimum.
     """
     ends = score.start_kwh, score.start_tasks, score.end_kwh, score.end_tasks
     valued = score.figure - optimum.end_value(*ends)
@@ -87,12 +88,12 @@ def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
 
 
 def share_of_achievable(figures: F64, idle: F64, achieved: F64) -> F64:
-    """Share of the achievable of each figure; nan where the optimum is no better than idle.
+    """Return the share of the achievable, (B,); nan if the optimum is no better than idle commands.
 
     Args:
-        figures: figures, with the value of their ends, (B,).
-        idle: those of idle commands, (B,).
-        achieved: those of the optimum's achieved path, (B,); nan where there is none.
+        figures: Objective values of the run, including the value of its end state, (B,).
+        idle: Objective values of idle commands, (B,).
+        achieved: Objective values of the optimum's achieved path, (B,); nan if there is none.
     """
     room = idle - achieved
     share = np.full(room.shape, np.nan)
@@ -111,23 +112,23 @@ def run_beside(
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Achievement | None:
-    """Run a controller over the steps of a known optimum, and compare it with that.
+    """Run a controller for the steps of a known optimum, and compare it with the optimum.
 
     Args:
-        optimum: known optimum of the simulator's configs and inputs.
-        sim: the simulator.
-        controller: gives the actions of every step.
-        name: name of the controller.
-        seed: of the simulator's events, of the controller and of errors of forecasts.
-        forecast_error: how the forecasts err that the controller sees.
-        on_step: called with the result of every step.
-        stop: asked before every step; true ends the run.
+        optimum: Known optimum of the simulator's configs and inputs.
+        sim: The simulator.
+        controller: Controller of the run.
+        name: Name of the controller.
+        seed: Seed of the simulator's events, the controller and the forecast errors.
+        forecast_error: Error model of the forecasts that the controller sees.
+        on_step: Callback that receives the result of every step.
+        stop: Callback before every step; the run ends if it returns True.
 
     Returns:
-        What the controller reached; None if it was stopped.
+        Comparison of the controller with the optimum; None if the run was stopped.
 
     Raises:
-        SdcError: the optimum is of other configs or inputs.
+        SdcError: The optimum belongs to other configs or inputs.
     """
     score = begin_score(optimum, sim, seed)
 
@@ -149,18 +150,18 @@ def run_beside(
 
 
 def begin_score(optimum: Optimum, sim: Simulator, seed: int) -> Score:
-    """Reset a simulator for a run to be compared with a known optimum.
+    """Reset a simulator for a run that will be compared with a known optimum.
 
     Args:
-        optimum: known optimum of the simulator's configs and inputs.
-        sim: the simulator.
-        seed: of the simulator's events.
+        optimum: Known optimum of the simulator's configs and inputs.
+        sim: The simulator.
+        seed: Seed of the simulator's events.
 
     Returns:
-        Score to add the steps of the run to.
+        Empty score, to which the steps of the run are to be added.
 
     Raises:
-        SdcError: the optimum is of other configs or inputs.
+        SdcError: The optimum belongs to other configs or inputs.
     """
     sim.reset(seed)
     seeds = seeds_of_sampled_events(sim.state.seed, sim.fleet)
@@ -177,9 +178,9 @@ def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) 
     """Add the comparison with a known optimum to the content of metrics.json.
 
     Args:
-        content: content of metrics.json, which is added to.
-        optimum: known optimum of the same configs, inputs and steps.
-        reached: what the run reached.
+        content: Content of metrics.json, which is modified.
+        optimum: Known optimum of the same configs, inputs and steps.
+        reached: Comparison of the run with the optimum.
     """
     figures = {
         "idle_figure": optimum.idle,
@@ -205,9 +206,10 @@ def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) 
 
 
 def _broken(optimum: Optimum, score: Score, dc: int) -> list[str]:
-    """Constraints that a data center broke and the achieved path did not, in words.
+    """Return texts on the constraints that a data center violated and the achieved path did not.
 
-    Where no setpoint keeps a limit, the achieved path does not either.
+    If no setpoint satisfies a limit, the achieved path violates it as well, which is no fault of
+    the controller.
     """
     best, hot = optimum.certificates[dc], ""
     limit_c, hottest_c = optimum.inlet_limit_c[dc], score.hottest_inlet_c[dc]

@@ -1,4 +1,4 @@
-"""Description of a run before its first step: versions, processor, seed, inputs, data centers."""
+"""Description of a run: versions, processor, seed, inputs and data centers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
 FORMAT = "sdc-run/2"
-"""Version of the format of metrics.json, which its field ``format`` names."""
+"""Format version of metrics.json, stored in its field ``format``."""
 VECTOR_FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "asimd", "sve")
-"""Vector extensions of processors that libraries have special code for, by their names in Linux."""
+"""Linux names of the vector extensions for which libraries have special code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +35,17 @@ class RunRequest:
     steps: int
     """Number of steps to simulate."""
     seed: int = 0
-    """Seed of the simulator's events, of the controller and of errors of forecasts."""
+    """Seed of the simulator's events, the controller and the forecast errors."""
     forecast_error: ForecastError = PERFECT
-    """How the forecasts err that the controller sees."""
+    """Error model of the forecasts that the controller sees."""
 
 
 def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
-    """The part of metrics.json that is known before the first step.
+    """Return the part of metrics.json that is known before the first step.
 
     Args:
-        sim: the simulator.
-        request: what it is asked to do.
+        sim: The simulator.
+        request: Requested controller, steps and seed.
     """
     drivers = sim.drivers
     hashes = _file_hashes(sim.fleet.configs)
@@ -83,9 +83,9 @@ def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
 
 @functools.cache
 def _versions() -> Mapping[str, str]:
-    """Versions of Python and packages, and features of the processor, that results depend on.
+    """Return the versions and processor features on which results depend.
 
-    They are kept, because looking them up reads the packages' metadata from disk.
+    The result is cached, because every look-up reads the metadata of packages from disk.
     """
     packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
     return {
@@ -96,7 +96,7 @@ def _versions() -> Mapping[str, str]:
 
 
 def _input_files(config: DataCenterConfig) -> dict[str, str]:
-    """Paths of the files that a config names, by the input that they give."""
+    """Return the paths of the input files that a config names, by the kind of input."""
     site = config.site
     named = {
         "weather": site.weather_file,
@@ -108,24 +108,25 @@ def _input_files(config: DataCenterConfig) -> dict[str, str]:
 
 
 def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
-    """SHA-256 of every file that the configs name, by path.
+    """Return the SHA-256 of every file that the configs name, by path.
 
-    Drivers made from arrays need no such file, so one that is gone has the hash "missing".
+    A file that does not exist has the hash "missing"; it is not an error, because drivers that are
+    made from arrays do not need the files.
     """
     paths = {path for config in configs for path in _input_files(config).values()}
     return {p: sha256(Path(p)) if os.path.isfile(p) else "missing" for p in sorted(paths)}
 
 
 def processor_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Features by name, the same in every process that sees the same environment.
+    """Return the features of processor and libraries on which the last bits of results depend.
 
-    ``architecture``: of the processor. ``processor``: those of its ``VECTOR_FEATURES`` that the
-    system tells, for which Taichi compiles. ``numpy-simd``: extensions that NumPy uses.
-    ``openblas``: version of OpenBLAS, and the processor whose code it picked. ``libc``: the C
-    library, whose exponentials and powers differ between versions and processors.
+    ``architecture`` is the processor architecture. ``processor`` lists the ``VECTOR_FEATURES`` of
+    the processor, for which Taichi compiles. ``numpy-simd`` lists the extensions that NumPy uses.
+    ``openblas`` is the version of OpenBLAS and the processor type whose code it selected. ``libc``
+    is the C library, whose exponentials and powers differ between versions and processors.
 
     Args:
-        cpuinfo: What Linux tells of the processor (proc(5)).
+        cpuinfo: File in which Linux describes the processor (proc(5)).
     """
     simd = np.show_config(mode="dicts")["SIMD Extensions"]
     openblas = [
@@ -143,14 +144,14 @@ def processor_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
 
 
 def _vector_features(cpuinfo: Path) -> str:
-    """Features of the first processor; unknown where the system does not tell."""
+    """Return the ``VECTOR_FEATURES`` of the first processor; "unknown" if Linux lists none."""
     try:
         lines = cpuinfo.read_text("utf-8", errors="replace").splitlines()
     except OSError:
         return "unknown"
     for line in lines:
         name, _, features = line.partition(":")
-        # "flags" of x86, "Features" of ARM.
+        # The line is named "flags" on x86 and "Features" on ARM.
         if name.strip().lower() in ("flags", "features"):
             has = features.split()
             return " ".join(each for each in VECTOR_FEATURES if each in has) or "none"

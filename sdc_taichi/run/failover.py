@@ -1,6 +1,6 @@
-"""Failover of a hall: each CRAC unit and each pair of units lost at full load, side by side.
+"""Failover study of a hall: loss of CRAC units or plant devices at full load.
 
-Every loss is a copy of the data center in one simulator, and lasts from the first step to the end.
+For each loss, a copy of the data center runs in one simulator. The loss lasts for the whole study.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 
 Lost = Literal["units", "plant"]
-"""What is lost: CRAC units, or devices of the plant."""
+"""Kind of loss: CRAC units, or devices of the cooling plant."""
 
 MINUTES = 60
-"""Length of a study, in steps of a minute."""
+"""Length of a study, in one-minute steps."""
 SUBSTEP_S = 5.0
-"""Longest substep, in s: air before racks follows its mix within some 20 s."""
+"""Maximum length of a substep, in s; the air before a rack follows its mix within about 20 s."""
 MOST_UNITS_PAIRED = 12
-"""Most CRAC units of which all pairs are lost; of more, each with its nearest neighbour."""
+"""Maximum number of CRAC units for which every pair is studied; with more units, each unit is
+paired only with its nearest neighbour."""
 MOST_LOSSES = 200
-"""Most losses of a study; of more CRAC units than that, evenly spread ones are lost."""
+"""Maximum number of losses of a study; with more CRAC units, an evenly spaced selection is
+studied."""
 MOST_UNIT_SHARES = 100_000_000
-"""Most shares of units in the supply of racks, over all losses of a study: some 2 GB."""
+"""Maximum number of shares of units in the supply of racks, summed over all losses: about 2 GB."""
 SHOWN_AFTER_MIN = (15, 60)
 """Minutes after which studies report the hottest inlet."""
 DEVICES: dict[EventKind, str] = {
@@ -51,59 +53,58 @@ DEVICES: dict[EventKind, str] = {
     "dry_cooler_down": "dry cooler",
     "outdoor_air_closed": "outdoor air",
 }
-"""Devices of plants by the event that takes them, in words."""
+"""Text for the plant devices that each kind of event disables."""
 CLASS = "A2"
-"""Class of the servers, whose limits they throttle and trip at, where the config names none."""
+"""ASHRAE class for thermal protection of the servers, if the config names no class."""
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What goes out of order at the start of a study, and stays so."""
+    """Devices that fail at the start of a study and stay down."""
 
     name: str
-    """What is lost, in words."""
+    """Text for the failed devices."""
     units: tuple[int, ...]
-    """CRAC units that are down, counted from 0; empty for devices of the plant."""
+    """Failed CRAC units, counted from 0; empty for devices of the plant."""
     events: tuple[ScheduledEvent, ...]
-    """Events of a config that lose it; none for a hall in order."""
+    """Events that disable the devices; empty for the case without a loss."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failover:
-    """What N losses do to a hall of R racks at full load, over T minutes.
+    """Results of a failover study: N losses in a hall of R racks at full load, over T minutes.
 
-    The first of them is no loss at all.
+    The first of the N cases is the hall without a loss.
     """
 
     config: DataCenterConfig
-    """The data center as it was studied, without events."""
+    """Config of the studied data center, without events."""
     losses: tuple[Loss, ...]
-    """The losses, N."""
+    """The N losses, of which the first is the case without a loss."""
     note: str
-    """Which losses were left out, as a sentence; empty for none."""
+    """Sentence on omitted losses; empty if none was omitted."""
     supply_c: float
-    """Supply air at full load without a loss, in C."""
+    """Supply temperature at full load without a loss, in C."""
     outdoor_c: float
-    """Dry bulb outside, in C."""
+    """Outdoor dry bulb, in C."""
     wet_bulb_c: float
-    """Wet bulb outside, in C."""
+    """Outdoor wet bulb, in C."""
     it_kw: float
     """IT power in the first minute without a loss, in kW."""
     inlet_max_c: F64
-    """Hottest inlet of the hall in each minute, in C, (T, N)."""
+    """Highest inlet temperature of the hall in each minute, in C, (T, N)."""
     rack_inlet_c: F64
-    """Hottest inlet of each rack in the last minute of the first of ``SHOWN_AFTER_MIN``, in C,
-    (N, R)."""
+    """Highest inlet temperature of each rack after ``SHOWN_AFTER_MIN[0]`` minutes, in C, (N, R)."""
     throttle_min: F64
-    """Minutes until the first rack throttles or trips, nan for never, (N,)."""
+    """Minutes until the first rack throttles or trips, nan if none does, (N,)."""
     trip_min: F64
-    """Minutes until the first rack trips, nan for never, (N,)."""
+    """Minutes until the first rack trips, nan if none does, (N,)."""
     racks_off: F64
-    """Racks that are off at the end, (N,)."""
+    """Number of racks that are off at the end, (N,)."""
 
     @property
     def worst(self) -> list[int]:
-        """Losses by how soon racks trip, then throttle, then by the hottest inlet, (N,)."""
+        """Indices of the losses, worst first: by time to trip, time to throttle, hottest inlet."""
         inlet_c = self.inlet_max_c.max(axis=0)
         never = float(MINUTES + 1)
         trip, throttle = (np.nan_to_num(x, nan=never) for x in (self.trip_min, self.throttle_min))
@@ -111,17 +112,17 @@ class Failover:
 
 
 def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
-    """Lose each CRAC unit and each pair of them, or each device of the plant, at full load.
+    """Study the loss of each CRAC unit and pair of units, or of each plant device, at full load.
 
-    In design weather, at the supply air of the design point as far as the setpoint reaches it, with
-    temperatures that take time to change and the class of the config, or ``CLASS``.
+    The study uses design weather, transient halls, the design supply temperature within the range
+    of setpoints, and the configured ASHRAE class of the servers, or else ``CLASS``.
 
     Args:
-        config: The data center; its own events are left out.
-        lost: What is lost.
+        config: Config of the data center; its events are ignored.
+        lost: Kind of loss.
 
     Raises:
-        ConfigError: Inlet model ``approach``, which knows no CRAC units and no room.
+        ConfigError: The inlet model is ``approach``, which models neither CRAC units nor room air.
     """
     base, supply_c = _studied(config)
     losses, note = unit_losses(base) if lost == "units" else (plant_losses(base), "")
@@ -149,7 +150,7 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     )
     with Simulator(build_fleet(copies), drivers=drivers) as sim:
         sim.reset()
-        results = [_kept(sim.step(), step) for step in range(MINUTES)]
+        results = [_copied(sim.step(), step) for step in range(MINUTES)]
     throttled, tripped = (np.array([r[name] for r in results]) for name in ("hot", "tripped"))
     shown = results[SHOWN_AFTER_MIN[0] - 1]["rack_inlet_c"]
     return Failover(
@@ -169,7 +170,7 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
 
 
 def unit_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
-    """No loss, each CRAC unit and each pair of them, and which of them are left out."""
+    """Return the case without a loss, each unit and each pair, and a note on omitted losses."""
     units = config.hvac.crac.units
     most = min(MOST_LOSSES, max(2, MOST_UNIT_SHARES // (config.hall.racks * units)))
     singles: list[tuple[int, ...]] = [(unit,) for unit in range(units)]
@@ -197,7 +198,7 @@ def unit_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
 
 
 def plant_losses(config: DataCenterConfig) -> tuple[Loss, ...]:
-    """No loss, and half and all of each device that the plant of a config has."""
+    """Return the case without a loss, and the loss of half and all of each plant device."""
     plant = config.hvac.plant_in_use
     return (
         Loss("no loss", (), ()),
@@ -211,12 +212,12 @@ def plant_losses(config: DataCenterConfig) -> tuple[Loss, ...]:
 
 
 def _event(kind: Any, **more: Any) -> ScheduledEvent:
-    """An event that lasts from the start of a study beyond its end."""
+    """Return an event that lasts for a whole study."""
     return ScheduledEvent(kind=kind, start_h=0.0, duration_h=float(MINUTES), **more)
 
 
 def _neighbours(config: DataCenterConfig) -> list[tuple[int, ...]]:
-    """Each CRAC unit and the nearest other one, in order."""
+    """Return a pair of each CRAC unit and its nearest neighbour; within a pair, units ascend."""
     places = unit_places_m(floor_plan(config.hall), config.hvac.crac.units)
     out: list[tuple[int, ...]] = []
     for unit, place in enumerate(places):
@@ -227,7 +228,7 @@ def _neighbours(config: DataCenterConfig) -> list[tuple[int, ...]]:
 
 
 def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
-    """A data center as it is studied, without events, and its supply air in C."""
+    """Return the config for the study, without events, and its supply temperature in C."""
     if config.hall.inlet_model != "recirculation":
         raise ConfigError(
             f"{config.name}: hall.inlet_model {config.hall.inlet_model} has no air that a loss of "
@@ -249,8 +250,8 @@ def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
     return with_values(config, values), setpoint_c - over_supply_k
 
 
-def _kept(result: StepResult, step: int) -> dict[str, Any]:
-    """Quantities of a step that a study needs, copied."""
+def _copied(result: StepResult, step: int) -> dict[str, Any]:
+    """Return copies of the quantities of a step that a study needs."""
     values: dict[str, Any] = {
         "inlet_max_c": result.inlet_max_c,
         "tripped": result.tripped_racks,
@@ -264,12 +265,15 @@ def _kept(result: StepResult, step: int) -> dict[str, Any]:
 
 
 def _first_minute(happens: Any) -> F64:
-    """Minutes to the end of the first step in which something happens, nan for never, (N,)."""
+    """Return the minutes to the end of the first step in which ``happens`` is True, (N,).
+
+    The result is nan if it is never True. ``happens`` has shape (T, N).
+    """
     return np.where(happens.any(axis=0), np.argmax(happens, axis=0) + 1.0, np.nan)
 
 
 def failover_values(study: Failover) -> dict[str, Any]:
-    """A study as plain values for JSON; units are in the keys, None is never."""
+    """Convert a study to plain values for JSON; keys name the units, None means never."""
     return {
         "name": study.config.name,
         "supply_c": study.supply_c,
@@ -283,7 +287,7 @@ def failover_values(study: Failover) -> dict[str, Any]:
 
 
 def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]:
-    """Losses in an order, each as plain values: units are in the keys, None is never."""
+    """Convert losses in the given order to plain values; keys name the units, None means never."""
     return [
         {
             "lost": study.losses[i].name,

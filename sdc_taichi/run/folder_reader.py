@@ -1,8 +1,8 @@
-"""Read a run folder: its metrics.json and steps.parquet (see docs/run-folder.md).
+"""Reader of run folders: metrics.json and steps.parquet (see docs/run-folder.md).
 
-Rows of steps.parquet follow each other step by step, and within a step in the order of the data
-centers, so a column is an array (steps, data centers). It is read a row group at a time: a year of
-a large fleet needs no more memory than the columns and data centers that are asked for.
+Rows of steps.parquet are ordered by step, and within a step by data center, so that a column is an
+array (steps, data centers). The reader loads one row group at a time, so that memory is needed only
+for the requested columns and data centers, even for a year of a large fleet.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ _INTERVALS_H = (0.25, 0.5, 1, 2, 3, 6, 12, 24, 48, 96, 168, 336, 720, 2160, 8760
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """A run folder whose metrics.json has been read and checked."""
+    """Run folder with the checked content of its metrics.json."""
 
     path: Path
-    """The folder."""
+    """Path of the folder."""
     metrics: dict[str, Any]
     """Content of metrics.json."""
 
@@ -87,31 +87,32 @@ class RunFolder:
 
     @property
     def hours(self) -> float:
-        """Length of the steps done, in h."""
+        """Simulated time of the completed steps, in h."""
         return float(self.metrics["steps_done"] * self.metrics["step_h"])
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSteps:
-    """All data centers of a run together."""
+    """Fleet totals of a run by step, and hottest inlets of B data centers by interval."""
 
     series: pd.DataFrame
-    """One row per step: ``time`` on the clock of the first data center, sums over the data centers
-    of ``it_w``, ``overhead_w`` (W) and ``carbon_g`` (g), and of their hottest inlets the 10 %, 50 %
-    and 90 % quantile and the maximum, ``inlet_low_c``, ``inlet_mid_c``, ``inlet_high_c`` and
-    ``inlet_max_c`` (C)."""
+    """One row per step. ``time`` is the time of the first data center; ``it_w``, ``overhead_w`` (W)
+    and ``carbon_g`` (g) are sums over the data centers. ``inlet_low_c``, ``inlet_mid_c``,
+    ``inlet_high_c`` and ``inlet_max_c`` (C) are the 10 %, 50 % and 90 % quantile and the maximum of
+    the data centers' hottest inlets."""
     edge_times: npt.NDArray[np.datetime64]
-    """Beginnings of m intervals, equal but for the last, and the end of the run, (m + 1,)."""
+    """Start times of m intervals, and the end of the run, (m + 1,); all intervals but the last have
+    equal length."""
     inlet_max_c: F64
-    """Hottest inlet of each interval and data center, in C, (m, B)."""
+    """Highest inlet temperature in each interval and data center, in C, (m, B)."""
 
 
 def read_run(folder: str | Path) -> RunFolder:
-    """Read metrics.json and check it and steps.parquet against each other.
+    """Open a run folder: read metrics.json and check that steps.parquet matches it.
 
     Raises:
-        SdcError: there is no such folder, no run in it or one of another format, or a file is
-            damaged or of another run.
+        SdcError: The folder does not exist, contains no run or a run of another format, or a file
+            is damaged or belongs to another run.
     """
     path = Path(folder)
     if not os.path.isdir(path):
@@ -125,12 +126,12 @@ def read_run(folder: str | Path) -> RunFolder:
 def read_steps(
     run: RunFolder, dcs: Sequence[int], columns: Sequence[str] | None = None
 ) -> list[pd.DataFrame]:
-    """Steps of some data centers, a DataFrame each, with ``step``, ``time`` and other columns.
+    """Read the steps of some data centers as DataFrames with ``step``, ``time`` and more columns.
 
     Args:
-        run: the run.
-        dcs: indices of the data centers.
-        columns: names of the other columns; None is all of them.
+        run: The run.
+        dcs: Indices of the data centers; the result has one DataFrame for each.
+        columns: Names of the further columns; None reads all columns.
 
     Raises:
         SdcError: steps.parquet is damaged, lacks a column, or its rows are out of order.
@@ -151,7 +152,7 @@ def read_steps(
 
 
 def read_fleet_steps(run: RunFolder) -> FleetSteps:
-    """Read the sums over the data centers by step, and their hottest inlets.
+    """Read the fleet totals of every step, and the hottest inlets of the data centers.
 
     Raises:
         SdcError: steps.parquet is damaged, lacks a column, or its rows are out of order.
@@ -190,15 +191,16 @@ def read_fleet_steps(run: RunFolder) -> FleetSteps:
 
 
 def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
-    """Read the configs of some data centers, which steps.parquet holds.
+    """Read the configs of some data centers from the metadata of steps.parquet.
 
     Raises:
-        SdcError: they are missing or not valid.
+        SdcError: The configs are missing or not valid.
     """
     text = _stored_metadata(run.steps_path).get("configs_yaml")
     if not isinstance(text, str):
         raise SdcError(f"{run.steps_path}: no configs_yaml; valid is a file written by simulate")
-    # YAML allows no other line of three dashes, and reading all of a large fleet takes minutes.
+    # Split the text at document separators and parse only the requested documents, because parsing
+    # all documents of a large fleet takes minutes.
     documents = ("\n" + text).split("\n---\n")
     documents = documents[1:] if len(documents) > 1 else documents
     if len(documents) != len(run.names):
@@ -215,17 +217,17 @@ def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
 
 
 def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
-    """Racks of some data centers over the run, a DataFrame each with a row per rack, in order.
+    """Read rack statistics of some data centers as DataFrames with one row per rack.
 
-    Columns are ``hottest_h``, the time in which the hottest inlet of the rack was that of the hall,
-    up to ``TIE_K``, in h, and ``inlet_max_c``, the highest inlet of the rack, in C.
+    Column ``hottest_h`` is the time, in h, during which the rack had the hottest inlet of its hall,
+    within ``TIE_K``. Column ``inlet_max_c`` is the highest inlet temperature of the rack, in C.
 
     Args:
-        run: the run.
-        dcs: indices of the data centers.
+        run: The run.
+        dcs: Indices of the data centers; the result has one DataFrame for each.
 
     Raises:
-        SdcError: steps.parquet is damaged or lacks them.
+        SdcError: steps.parquet is damaged or has no rack statistics.
     """
     import pandas as pd
 
@@ -255,7 +257,7 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
 
 
 def read_hottest_air(run: RunFolder, dc: int) -> object:
-    """What steps.parquet holds of the air of a data center in its hottest step; None if nothing.
+    """Read the stored air of a data center in its hottest step; None if the run stored no air.
 
     Raises:
         SdcError: steps.parquet is damaged.
@@ -270,7 +272,7 @@ def read_hottest_air(run: RunFolder, dc: int) -> object:
 
 
 def _read_metrics(path: Path) -> dict[str, Any]:
-    """Content of metrics.json, checked field by field."""
+    """Read metrics.json and check its fields."""
     with _part_of_run():
         text = read_text(path, MOST_METRICS_BYTES)
     try:
@@ -278,8 +280,8 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise SdcError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise SdcError(f"{path}: format {found!r}; valid is {FORMAT!r}, simulate the run again")
+        label = content.get("format") if isinstance(content, dict) else type(content).__name__
+        raise SdcError(f"{path}: format {label!r}; valid is {FORMAT!r}, simulate the run again")
     _check_fields(path, "", content, _METRICS_TYPES)
     done, asked, step_h = content["steps_done"], content["steps_asked"], content["step_h"]
     if not 1 <= done <= asked:
@@ -304,10 +306,10 @@ def _read_metrics(path: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _part_of_run() -> Iterator[None]:
-    """Say of a file that is missing what should hold it.
+    """Extend the error for a missing file by a hint on what a valid folder contains.
 
     Raises:
-        SdcError: as in the block.
+        SdcError: The block has raised it.
     """
     try:
         yield
@@ -319,12 +321,12 @@ def _part_of_run() -> Iterator[None]:
 
 
 def is_number(value: object) -> bool:
-    """Whether a JSON value is a number that a float holds; true and false are none."""
+    """Return True if a JSON value is a number in the range of a float, and not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _check_event(place: str, event: Mapping[str, Any], done: int) -> None:
-    """Check the steps and amounts of an event against the steps done."""
+    """Check the steps of an event against the number of completed steps, and its amounts."""
     start, end = event["start_step"], event["end_step"]
     if not 0 <= start < min(done, end) or end >= 1 << 63:
         raise SdcError(
@@ -342,10 +344,10 @@ def _check_fields(
     values: Mapping[str, Any],
     expected: Mapping[str, type | tuple[type, ...]],
 ) -> None:
-    """Check that the fields of a JSON object are there and of their types."""
+    """Check that a JSON object has all expected fields with the expected types."""
     for name, kind in expected.items():
         value = values.get(name)
-        # A bool is an int in Python, and no number here.
+        # In Python, a bool is also an int, but it is not a valid number here.
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             problem = f"is {value!r}" if name in values else "is missing"
             names = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
@@ -353,27 +355,27 @@ def _check_fields(
 
 
 def _check_steps_file(run: RunFolder) -> None:
-    """Check that steps.parquet is of the run that metrics.json describes, and has all its rows."""
+    """Check that steps.parquet belongs to the run of metrics.json, and has all its rows."""
     path = run.steps_path
-    stored, given = _flat_description(_stored_metadata(path)), _flat_description(run.metrics)
-    for name in {**stored, **given}:
-        if stored.get(name) != given.get(name):
+    stored, expected = _flat_description(_stored_metadata(path)), _flat_description(run.metrics)
+    for name in {**stored, **expected}:
+        if stored.get(name) != expected.get(name):
             raise SdcError(
                 f"{path}: {name} {shortened(stored.get(name))} is not that of {METRICS_FILE}, "
-                f"{shortened(given.get(name))}; simulate the run again"
+                f"{shortened(expected.get(name))}; simulate the run again"
             )
     with _open_parquet(path) as file:
         rows = file.metadata.num_rows
-    expected = run.metrics["steps_done"] * len(run.names)
-    if rows != expected:
+    expected_rows = run.metrics["steps_done"] * len(run.names)
+    if rows != expected_rows:
         raise SdcError(
-            f"{path}: {rows} rows, expected {expected} as steps_done and data_centers of "
+            f"{path}: {rows} rows, expected {expected_rows} as steps_done and data_centers of "
             f"{METRICS_FILE} say; simulate the run again"
         )
 
 
 def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields that steps.parquet and metrics.json both hold, by their paths."""
+    """Return the fields that steps.parquet and metrics.json have in common, by their paths."""
     others = ("data_centers", "steps_done", "total", "configs_yaml", "optimum")
     out = {name: value for name, value in content.items() if name not in others}
     for index, dc in enumerate(content.get("data_centers", ())):
@@ -384,10 +386,10 @@ def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file, of which the metadata are read.
+    """Open a Parquet file and read its metadata.
 
     Raises:
-        SdcError: there is no such file, or it is damaged.
+        SdcError: The file does not exist or is damaged.
     """
     import pyarrow.parquet as pq
 
@@ -398,7 +400,7 @@ def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def _stored_metadata(path: Path) -> dict[str, Any]:
-    """Description of the run that the metadata of steps.parquet hold."""
+    """Read the description of the run from the metadata of steps.parquet."""
     stored = _stored_json(path, METADATA_KEY)
     if not isinstance(stored, dict):
         raise SdcError(f"{path}: no sdc_taichi metadata; valid is a file written by simulate")
@@ -406,7 +408,7 @@ def _stored_metadata(path: Path) -> dict[str, Any]:
 
 
 def _stored_json(path: Path, key: bytes) -> object:
-    """What the metadata of steps.parquet hold under a key; None if there is no JSON under it."""
+    """Read the JSON value of a metadata key of steps.parquet; None if missing or not valid."""
     with _open_parquet(path) as file:
         metadata = file.metadata.metadata or {}
     try:
@@ -416,14 +418,14 @@ def _stored_json(path: Path, key: bytes) -> object:
 
 
 def _column_names(run: RunFolder) -> list[str]:
-    """Columns of steps.parquet that hold quantities."""
+    """Return the names of the quantity columns of steps.parquet."""
     with _open_parquet(run.steps_path) as file:
         names = file.schema_arrow.names
     return [name for name in names if name not in ("dc", "step", "time")]
 
 
 def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, npt.NDArray[Any]]]:
-    """Row groups as arrays (steps, data centers), ``step`` and ``time`` among them."""
+    """Yield row groups as arrays (steps, data centers) by column, with ``step`` and ``time``."""
     path = run.steps_path
     wanted = ("dc", "step", "time", *columns)
     with _open_parquet(path) as file:
@@ -441,13 +443,13 @@ def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, np
 
 
 def _as_steps(run: RunFolder, index: int, table: pa.Table, done: int) -> dict[str, Any]:
-    """A row group as arrays (steps, data centers), checked.
+    """Convert a row group to arrays (steps, data centers) and check the order of its rows.
 
     Args:
-        run: the run.
-        index: number of the row group, for messages.
-        table: its columns.
-        done: number of steps in the row groups before.
+        run: The run.
+        index: Index of the row group, for error messages.
+        table: Columns of the row group.
+        done: Number of steps in the preceding row groups.
     """
     path, size = run.steps_path, len(run.names)
     if table.num_rows % size:
@@ -465,7 +467,7 @@ def _as_steps(run: RunFolder, index: int, table: pa.Table, done: int) -> dict[st
 
 
 def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
-    """Values of a column of an Arrow table, whose type is checked."""
+    """Convert a column of an Arrow table to an array after checking its type."""
     column = table.column(name)
     kind = {"step": "int64", "time": "timestamp[ms]"}.get(name, "double")
     if str(column.type) != kind or column.null_count:

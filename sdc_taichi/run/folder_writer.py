@@ -1,9 +1,10 @@
-"""Simulate and write a run folder.
+"""Simulation of a run and writer of its run folder.
 
-A run folder holds ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
-``configs.yaml`` (several, one YAML document each). Every file is written beside its place and
-renamed when it is whole, and a second run into the folder is refused meanwhile. Equal runs give
-equal bytes on processors with the same features. See docs/run-folder.md for the columns.
+A run folder contains ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
+``configs.yaml`` (several, one YAML document each). Every file is written under a temporary name and
+renamed when it is complete; while a run writes, a second run into the folder is refused. Equal runs
+produce identical bytes on processors with the same features. See docs/run-folder.md for the
+columns.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from sdc_taichi.types import StepResult
 from sdc_taichi.user_file import MOST_METRICS_BYTES, read_text
 
 METRICS_FILE = "metrics.json"
-"""Written last, so that its presence marks the folder of a whole run."""
+"""Name of the metrics file, which is written last: its presence marks a complete run folder."""
 REPORT_FILE = "report.html"
-"""Written by ``sdc-taichi report`` from the other files of a run folder."""
+"""Name of the report that ``sdc-taichi report`` writes from the other files of a run folder."""
 OPTIMUM_FILE = "optimum.json"
-"""Written beside the run of a known optimum, by ``optimum_folder.write_optimum``."""
+"""Name of the file that ``optimum_folder.write_optimum`` adds to the run of a known optimum."""
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -52,27 +53,28 @@ def simulate_to_folder(
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> dict[str, Any] | None:
-    """Simulate as ``simulate`` does, and write the files of the run to a folder.
+    """Simulate a run with ``simulate``, and write its files to a folder.
 
     Args:
-        sim: the simulator; its data centers have distinct names.
-        controller: gives the actions of every step.
-        request: steps, seed, errors of forecasts and the controller's name.
-        out: folder, created if need be; files of a former run there are replaced.
-        force: also write into a folder with other files.
-        optimum: known optimum of the same configs, inputs and steps, beside which metrics.json is
-            to put the run; a run that ends early is put beside none.
-        on_step: called with the result of every step.
-        stop: asked before every step; true ends the run with files of the steps done.
+        sim: The simulator; its data centers must have distinct names.
+        controller: Controller of the run.
+        request: Steps, seed, forecast errors and name of the controller.
+        out: Folder of the run, created if necessary; files of an earlier run are replaced.
+        force: True allows a folder that contains other files.
+        optimum: Known optimum of the same configs, inputs and steps, with which metrics.json
+            compares the run; a run that ends early is not compared.
+        on_step: Callback that receives the result of every step.
+        stop: Callback before every step; if it returns True, the run ends and the completed steps
+            are written.
 
     Returns:
-        The content of metrics.json; None, and no files, if it was stopped before the first step.
+        The content of metrics.json; None, without files, if the run was stopped before its first
+        step.
 
     Raises:
-        PhysicalLimitError: a result that no data center can reach, after the files of the steps
-            before it are written.
-        SdcError: the folder is not free, another run is writing to it, a file cannot be written,
-            or the controller gave actions that are not valid.
+        PhysicalLimitError: A result is physically impossible; the files contain the steps before.
+        SdcError: The folder contains other files, another run is writing to it, a file cannot be
+            written, or an action of the controller is not valid.
     """
     sim.fleet.require_distinct_names()
     prepare_folder(out, force=force)
@@ -81,12 +83,12 @@ def simulate_to_folder(
     names = ["config.yaml", "configs.yaml"]
     config_name, other_name = names if sim.size == 1 else names[::-1]
     metadata = {**description, "configs_yaml": configs}
-    # A dict, because it keeps the order in which events began.
+    # A dict serves as an ordered set: events stay in the order of their first step.
     events: dict[ActiveEvent, None] = {}
-    # Open from the first step to the last file, it keeps a second run out of the folder.
+    # The open temporary file is a lock that keeps a second run out of the folder.
     metrics_file = AtomicFile(out / METRICS_FILE)
     with metrics_file, StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
-        # Asked again, as another run may have ended here before the claim.
+        # Check again, because another run may have finished here before the lock was taken.
         has_former_run = prepare_folder(out, force=force)
 
         score = None if optimum is None else begin_score(optimum, sim, request.seed)
@@ -115,7 +117,7 @@ def simulate_to_folder(
         except PhysicalLimitError as error:
             if totals.steps == 0:
                 raise
-            # The steps before are as good as those of a run that was interrupted.
+            # The completed steps are valid, so their files are written before the error is raised.
             beyond = error
         if totals.steps == 0:
             return None
@@ -137,12 +139,12 @@ def simulate_to_folder(
 
 
 def metrics_json(content: dict[str, Any]) -> str:
-    """JSON text of the content of metrics.json."""
+    """Return the content of metrics.json as JSON text."""
     return json.dumps(content, indent=2, allow_nan=False)
 
 
 def configs_yaml(configs: Sequence[DataCenterConfig]) -> str:
-    """YAML text of configs, one document per data center."""
+    """Return configs as YAML text, one document per data center."""
     dumped = (c.model_dump(mode="json") for c in configs)
     return yaml.dump_all(
         dumped, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, explicit_start=len(configs) > 1
@@ -153,14 +155,14 @@ def prepare_folder(out: Path, *, force: bool = False) -> bool:
     """Create the folder of a run, or check that its files may be replaced.
 
     Args:
-        out: the folder.
-        force: accept a folder that holds other files.
+        out: Path of the folder.
+        force: True allows a folder that contains other files.
 
     Returns:
-        Whether it holds a former run.
+        True if the folder contains an earlier run.
 
     Raises:
-        SdcError: it holds other files than those of a run and ``force`` is not set, or it cannot
+        SdcError: The folder contains files that are not of a run, without ``force``, or it cannot
             be created or read.
     """
     with naming_errors(out):
@@ -179,10 +181,10 @@ def prepare_folder(out: Path, *, force: bool = False) -> bool:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old one or the whole new one.
+    """Write a text file atomically: a reader sees either the old or the complete new content.
 
     Raises:
-        SdcError: it cannot be written.
+        SdcError: The file cannot be written.
     """
     with atomic_write(path) as file:
         file.write(text.encode())
@@ -191,13 +193,13 @@ def write_text(path: Path, text: str) -> None:
 def _metrics_content(
     description: dict[str, Any], totals: Totals, fleet: Fleet, events: Iterable[ActiveEvent]
 ) -> dict[str, Any]:
-    """Content of metrics.json: description, steps done, metrics and events."""
+    """Return the content of metrics.json: description, completed steps, metrics and events."""
     return {
         **description,
         "steps_done": totals.steps,
         "data_centers": [
-            {**dc, "metrics": metrics, "events": own_events}
-            for dc, metrics, own_events in zip(
+            {**dc, "metrics": metrics, "events": dc_events}
+            for dc, metrics, dc_events in zip(
                 description["data_centers"],
                 metrics_per_dc(totals, fleet),
                 _events_by_dc(events, fleet.size),
@@ -209,7 +211,7 @@ def _metrics_content(
 
 
 def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[str, Any]]]:
-    """Events of each of ``size`` data centers as metrics.json lists them, in the order given."""
+    """Return the events of each of ``size`` data centers as lists for metrics.json."""
     by_dc: list[list[dict[str, Any]]] = [[] for _ in range(size)]
     for event in events:
         fields = asdict(event)
@@ -219,15 +221,15 @@ def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[st
 
 
 def _is_left_by_broken_run(path: Path) -> bool:
-    """Whether a file is one that a run may leave when it ends before metrics.json is written."""
+    """Return True for a file that a run can leave behind if it ends before writing metrics.json."""
     names = (STEPS_FILE, REPORT_FILE, OPTIMUM_FILE)
     return path.name in names or path.suffix in (".part", ".rrd")
 
 
 def _is_run_folder(out: Path) -> bool:
-    """Whether a folder holds the metrics.json of a run."""
+    """Return True if a folder contains the metrics.json of a run."""
     try:
         content = load_json(read_text(out / METRICS_FILE, MOST_METRICS_BYTES))
-    except ValueError:  # errors of files among them
+    except ValueError:  # Errors of missing or unreadable files are ValueErrors too.
         return False
     return isinstance(content, dict) and str(content.get("format", "")).startswith("sdc-run/")

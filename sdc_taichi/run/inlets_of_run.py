@@ -1,4 +1,4 @@
-"""Inlets of a run that is done, as sums of parts: in its hottest step, or in any of its steps."""
+"""Causes of inlet temperatures in a finished run: in its hottest step, or in any step."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
 
 SAME_K = 1e-3
-"""Difference of the hottest inlets up to which a step that is simulated again is the same, in K."""
+"""Tolerance for the hottest inlet of a step that is simulated again, in K."""
 
 
 @dataclass(frozen=True, slots=True)
 class InletsAtStep:
-    """Inlets of one data center in one step of a run."""
+    """Inlet temperatures of one data center in one step of a run."""
 
     step: int
-    """The step, counted from 0 at reset."""
+    """Index of the step, counted from 0 at reset."""
     hottest_c: float
-    """Hottest server inlet of the step, in C; in transient halls of any substep, while ``inlets``
-    are those at the end of the step."""
+    """Highest server inlet temperature of the step, in C; in transient halls the maximum over the
+    substeps, whereas ``inlets`` describes the end of the step."""
     config: DataCenterConfig
     """Config of the data center."""
     inlets: Inlets
-    """Its inlets as sums of parts."""
+    """Inlet temperatures of the data center, split into parts."""
 
 
 def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
-    """Inlets of a data center in its hottest step, from the air that steps.parquet holds.
+    """Read the inlets of a data center in its hottest step from the air in steps.parquet.
 
     Args:
-        run: the run.
-        dc: index of the data center.
+        run: The run.
+        dc: Index of the data center.
 
     Returns:
-        The inlets; None where the run is too large for its air to be kept.
+        The inlets; None if the run was too large to store its air.
 
     Raises:
-        SdcError: steps.parquet is damaged, or a matrix file that the config names has gone.
+        SdcError: steps.parquet is damaged, or a matrix file that the config names is missing.
     """
     values = read_hottest_air(run, dc)
     if values is None:
@@ -66,19 +66,19 @@ def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
 
 
 def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
-    """Inlets of a data center in a step of a run, by simulating the run again up to that step.
+    """Compute the inlets of a data center in a step by simulating the run again up to that step.
 
-    The data center runs alone, with its controller, seed, precision and input files, which gives
-    the same bits; that its hottest inlet is that of the run is checked.
+    The data center is simulated alone, with controller, seed, precision and input files of the run,
+    which reproduces the run exactly. Its hottest inlet is checked against that of the run.
 
     Args:
-        run: the run.
-        dc: index of the data center.
-        step: the step, counted from 0 at reset.
+        run: The run.
+        dc: Index of the data center.
+        step: Index of the step, counted from 0 at reset.
 
     Raises:
-        SdcError: no such step, a controller that has no name, an input file that has gone, or a run
-            that does not repeat.
+        SdcError: The step does not exist, the controller is not available by name, an input file is
+            missing, or the run is not reproduced.
     """
     metrics = run.metrics
     if not 0 <= step < metrics["steps_done"]:
@@ -96,11 +96,11 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
         )
         air = sim.intake_air()
     (steps,) = read_steps(run, [dc], ["inlet_max_c"])
-    before_c, again_c = float(steps["inlet_max_c"].iloc[step]), float(results[0].inlet_max_c[0])
-    if not abs(before_c - again_c) <= SAME_K:
+    stored_c, again_c = float(steps["inlet_max_c"].iloc[step]), float(results[0].inlet_max_c[0])
+    if not abs(stored_c - again_c) <= SAME_K:
         raise SdcError(
             f"{run.path}: step {step} of {run.names[dc]}, simulated again alone, has a hottest "
-            f"inlet of {again_c:.3f} C, and had {before_c:.3f} C; valid is a run whose input files "
+            f"inlet of {again_c:.3f} C, and had {stored_c:.3f} C; valid is a run whose input files "
             "and versions are those of today, under a controller that treats a data center alike "
             "in any batch"
         )
@@ -108,8 +108,8 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
 
 
 def _fleet_of(run: RunFolder, dc: int) -> Fleet:
-    """A fleet of one data center of a run."""
+    """Build the fleet of one data center of a run."""
     with warnings.catch_warnings():
-        # The run itself has given these warnings.
+        # The same warnings were issued by the run itself.
         warnings.simplefilter("ignore", OddInputWarning)
         return build_fleet(read_configs(run, [dc]))

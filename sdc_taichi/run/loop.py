@@ -1,4 +1,4 @@
-"""The loop of a run: a simulator, step after step, under a controller."""
+"""Loop of a run: advance a simulator step by step under a controller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import I64, StepResult
 
 MOST_STEPS = 100 * 8760 * 60
-"""Most steps of a run: a century of minutes."""
+"""Maximum number of steps of a run: a century of one-minute steps."""
 
 
 def simulate(
@@ -30,23 +30,23 @@ def simulate(
     """Reset a simulator and its controller, and run them for some steps.
 
     Args:
-        sim: the simulator.
-        controller: gives the actions of every step.
-        steps: number of steps, at most ``MOST_STEPS``.
-        seed: of the simulator's events, of the controller and of errors of forecasts; or one for
-            each data center, (B,).
-        forecast_error: how the forecasts err that the controller sees.
-        on_step: called with the result of every step.
-        stop: asked before every step; true ends the run.
-        totals: totals that each step is added to as it is done; None makes new ones.
+        sim: The simulator.
+        controller: Controller of the run.
+        steps: Number of steps, at most ``MOST_STEPS``.
+        seed: Seed of the simulator's events, the controller and the forecast errors; or one seed
+            per data center, (B,).
+        forecast_error: Error model of the forecasts that the controller sees.
+        on_step: Callback that receives the result of every step.
+        stop: Callback before every step; the run ends if it returns True.
+        totals: Totals to which every completed step is added; None creates new totals.
 
     Returns:
-        Totals of the steps that were simulated, from which ``run.metrics`` makes metrics.
+        Totals of the completed steps, from which ``run.metrics`` computes metrics.
 
     Raises:
-        ConfigError: a number of steps out of bounds, or an event that starts after the end.
-        PhysicalLimitError: a result that no data center can reach.
-        SdcError: the controller gave actions that are not valid.
+        ConfigError: The number of steps is out of range, or an event starts after the end.
+        PhysicalLimitError: A result is physically impossible.
+        SdcError: An action of the controller is not valid.
     """
     steps = whole_number("steps", steps, 0, MOST_STEPS)
     require_events_start_before(steps * sim.step_h, sim.fleet.configs)

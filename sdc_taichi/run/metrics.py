@@ -1,8 +1,8 @@
 """Metrics of a run: energy, carbon, water, work and temperatures of each data center.
 
-``add_step`` sums the steps as they come, so a year of a large fleet needs no more memory than a
-day; ``metrics_per_dc`` and ``metrics_of_fleet`` turn the sums into metrics. Sums run step by step
-in f64, so a data center has the same metrics whatever the batch it is in.
+``add_step`` accumulates sums step by step, so that a year of a large fleet needs no more memory
+than a day; ``metrics_per_dc`` and ``metrics_of_fleet`` compute metrics from the sums. Sums are f64
+and separate for each data center, so its metrics do not depend on the other data centers.
 
 Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
 
@@ -17,15 +17,15 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     battery_throughput_kwh  energy delivered, as warranties count it
     over_27_degree_h  inlet temperature in excess of 27 C, summed over time, mean over the servers
     shi, rhi, rti_pct, rci_hi_pct, rci_lo_pct  means over the steps (see ``air_metrics``)
-    rci_hi_min_pct   rci_hi_pct of the worst step
-    time_to_throttle_min  from the start of the first event to the end of the first step since then
-                     in which a rack throttles or trips; None without either
+    rci_hi_min_pct   minimum of rci_hi_pct over the steps
+    time_to_throttle_min  from the start of the first event to the end of the first later step in
+                     which a rack throttles or trips; None if there is no event or no such step
     energy_cost      grid energy times the price of the tariff, step by step
-    demand_charge    price of a kW times the highest power of each month, mean over a step; a month
-                     that the run covers in part counts by that part
+    demand_charge    price of a kW times the largest step-mean power of each month; a month that the
+                     run covers only in part is weighted by the covered share
     cost             energy_cost + demand_charge, in the currency of the tariff
 
-A ratio without IT energy is None.
+A ratio to IT energy is None if there is no IT energy.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ _SUMMED_FIELDS = (
 )
 """Fields of ``StepResult`` that are summed over the steps."""
 _MEAN_FIELDS = ("shi", "rti_pct", "rci_hi_pct", "rci_lo_pct")
-"""Those of the summed fields whose metric is the mean over the steps."""
+"""Fields of ``_SUMMED_FIELDS`` whose metric is the mean over the steps."""
 
 
 @dataclass(slots=True)
 class Totals:
-    """Sums and extremes over the steps of a run, of B data centers."""
+    """Sums and extremes of quantities of B data centers over the steps of a run."""
 
     steps: int
     """Number of steps."""
@@ -91,41 +91,41 @@ class Totals:
     hot_steps: I64
     """Number of steps with an inlet above the recommended 27 C, (B,)."""
     queue_end_tasks: F64
-    """Queue at the end of the last step, in tasks, (B,)."""
+    """Queued work at the end of the last step, in tasks, (B,)."""
     queue_max_tasks: F64
-    """Longest queue, in tasks, (B,)."""
+    """Maximum queued work over the steps, in tasks, (B,)."""
     overdue_max_tasks: F64
-    """Most overdue work in a step, in tasks, (B,)."""
+    """Maximum overdue work over the steps, in tasks, (B,)."""
     hottest_inlet_c: F64
-    """Hottest server inlet of all steps, in C, (B,)."""
+    """Highest server inlet temperature over the steps, in C, (B,)."""
     hottest_rack: I64
-    """Rack of the hottest inlet, counted from 0 in its data center, (B,)."""
+    """Index of the rack with the hottest inlet, counted from 0 in its data center, (B,)."""
     hottest_server: I64
-    """Server of the hottest inlet, counted from the floor of its rack, (B,)."""
+    """Index of the server with the hottest inlet, from 0 at the floor of its rack, (B,)."""
     hottest_step: I64
-    """Step of the hottest inlet, counted from 0 at reset, (B,)."""
+    """Index of the step with the hottest inlet, counted from 0 at reset, (B,)."""
     rci_hi_min_pct: F64
-    """Lowest rack cooling index at the high end, in %, (B,)."""
+    """Minimum over the steps of the rack cooling index at the high end, in %, (B,)."""
     first_event_step: I64
-    """First step that an event covers, -1 without any, (B,)."""
+    """First step that an event covers, -1 if there is none, (B,)."""
     first_throttle_step: I64
-    """First step from ``first_event_step`` on with a rack that is throttled or off, -1 without any,
-    (B,)."""
+    """First step, from ``first_event_step`` on, with a throttled or tripped rack, -1 if there is
+    none, (B,)."""
     demand: BilledDemand
-    """Highest power of each month."""
+    """Peak power of each month, for demand charges."""
 
 
 def finite_or_none(value: float) -> float | None:
-    """A number for JSON, which has neither nan nor infinities."""
+    """Return a number for JSON: None if ``value`` is nan or infinite."""
     return float(value) if np.isfinite(value) else None
 
 
 def empty_totals(size: int, step_h: float) -> Totals:
-    """Totals of no steps.
+    """Return the totals before the first step of a run.
 
     Args:
-        size: number of data centers, B.
-        step_h: length of a step, in h.
+        size: Number of data centers, B.
+        step_h: Length of a step, in h.
     """
     return Totals(
         steps=0,
@@ -142,7 +142,7 @@ def empty_totals(size: int, step_h: float) -> Totals:
         rci_hi_min_pct=np.full(size, np.inf),
         first_event_step=np.full(size, -1),
         first_throttle_step=np.full(size, -1),
-        # Runs begin on a day of their own, which ``loop.simulate`` knows.
+        # ``loop.simulate`` replaces the billed demand by one with the actual start of the run.
         demand=no_demand(np.zeros(size, dtype=np.int64), round(1.0 / step_h)),
     )
 
@@ -173,7 +173,7 @@ def add_step(totals: Totals, result: StepResult) -> None:
 
 
 def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
-    """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
+    """Compute the metrics of every data center, in fleet order; at least one step is needed."""
     throttle_min = times_to_throttle_min(totals)
     demand_charge = _demand_charge(totals, fleet)
     out = []
@@ -203,13 +203,12 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
 
 
 def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
-    """Metrics of the whole fleet, from totals of at least one step.
+    """Compute the metrics of the whole fleet from totals of one or more steps.
 
-    Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of
-    the sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
-    highest over the data centers, because a task is 1 % of the capacity of its own data center;
-    ``peak_kw`` is the highest as well, ``time_to_throttle_min`` the shortest, and costs are those
-    of each data center's own bill.
+    Energies, carbon, water, tasks, hours and costs are sums over the data centers, and ratios are
+    ratios of these sums. ``queue_mean_tasks`` is the mean over the data centers, because a task is
+    1 % of the capacity of its data center. ``queue_max_tasks``, ``overdue_max_tasks`` and
+    ``peak_kw`` are maxima over the data centers, and ``time_to_throttle_min`` is the minimum.
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
@@ -239,9 +238,10 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
 
 
 def times_to_throttle_min(totals: Totals) -> list[float | None]:
-    """Minutes from the first event to the first throttled rack of each data center.
+    """Return the minutes from the first event to the first throttled rack of each data center.
 
-    To the end of the step in which it throttles; None without events or throttled racks.
+    The time ends at the end of the step in which the rack throttles. The value is None if there is
+    no event or no throttled rack.
     """
     steps = totals.first_throttle_step + 1 - totals.first_event_step
     throttles = totals.first_throttle_step >= 0
@@ -252,13 +252,13 @@ def times_to_throttle_min(totals: Totals) -> list[float | None]:
 
 
 def _demand_charge(totals: Totals, fleet: Fleet) -> F64:
-    """Demand charges of a run, in the currency of the tariff, (B,)."""
+    """Return the demand charges of a run, in the currency of the tariff, (B,)."""
     kw_months = billed_kw_months(totals.demand, totals.steps)
     return np.asarray(kw_months * fleet.values("tariff.demand_charge_per_kw"))
 
 
 def _cost(sums: dict[str, float], demand_charge: float, peak_kw: float) -> dict[str, Metric]:
-    """Metrics of money."""
+    """Return the metrics of peak power and cost."""
     return {
         "peak_kw": peak_kw,
         "energy_cost": sums["energy_cost"],
@@ -268,7 +268,7 @@ def _cost(sums: dict[str, float], demand_charge: float, peak_kw: float) -> dict[
 
 
 def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
-    """Rack, row and server of the hottest inlet of a data center."""
+    """Return rack, row and server of the hottest inlet of a data center."""
     rack = int(totals.hottest_rack[dc])
     return {
         "hottest_rack": rack,
@@ -278,17 +278,17 @@ def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
 
 
 def _mean_metrics(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:
-    """Means over the steps of the summed air metrics, and the RHI that follows from the SHI."""
+    """Return the means over the steps of the air indices, and RHI = 1 - SHI."""
     means = {name: value / totals.steps for name, value in sums.items()}
     return {**means, "rhi": 1.0 - means["shi"]}
 
 
 def _energy_and_work(sums: dict[str, float], step_h: float) -> dict[str, Metric]:
-    """Metrics of energy, carbon, water and work.
+    """Compute the metrics of energy, carbon, water and work.
 
     Args:
-        sums: sum over the steps of each summed field of ``StepResult``, by name.
-        step_h: length of a step, in h.
+        sums: Sum over the steps of each field of ``_SUMMED_FIELDS``, by name.
+        step_h: Length of a step, in h.
     """
     it_kwh, hvac_kwh = sums["it_kwh"], sums["hvac_kwh"]
     overhead_kwh, ups_kwh, distribution_kwh, compression_kwh = (

@@ -1,7 +1,8 @@
-"""Known optima as files: optimum.json, beside the run folder of the achieved path.
+"""Files of known optima: optimum.json in the run folder of the achieved path.
 
-The achieved path is a run as any other, whose controller is named ``optimum``. ``optimum.json``
-holds the figures; metrics.json of a run beside which an optimum was solved repeats its own.
+The achieved path is stored as a normal run whose controller is named ``optimum``. ``optimum.json``
+contains the objective values of the optimum. If a run was compared with an optimum, its
+metrics.json contains the comparison as well.
 """
 
 from __future__ import annotations
@@ -25,21 +26,22 @@ from sdc_taichi.types import StepResult
 from sdc_taichi.user_file import MOST_METRICS_BYTES, read_text
 
 FORMAT = "sdc-optimum/1"
-"""Version of the format of optimum.json, which its field ``format`` names."""
+"""Format version of optimum.json, stored in its field ``format``."""
 FOLDER = "optimum"
-"""Name of the folder of an optimum inside that of the run beside which it was solved."""
+"""Name of the optimum's subfolder in the folder of the run that it is compared with."""
 _BOUND = "bound"
 _FIGURES = ("idle", "bound", "achieved")
 _ALL_OF_IT = 1.0 + 1e-6
-"""Share of the achievable beyond which a controller does better than the achieved path."""
+"""Share of the achievable above which a controller counts as better than the achieved path; the
+margin covers round-off."""
 
 
 def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> dict[str, Any]:
-    """Content of optimum.json.
+    """Return the content of optimum.json.
 
     Args:
-        optimum: the optimum.
-        reached: what controllers reached beside it.
+        optimum: The optimum.
+        reached: Comparisons of controllers with the optimum.
     """
     dcs = range(len(optimum.names))
     total = _figures(
@@ -86,23 +88,23 @@ def write_optimum(
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> bool:
-    """Run the achieved path of an optimum once more, into a run folder with optimum.json.
+    """Simulate the achieved path of an optimum, and write its run folder with optimum.json.
 
     Args:
-        sim: the simulator that the optimum is of.
-        optimum: the optimum.
-        out: the folder.
-        reached: what controllers reached beside it.
-        seed: of the simulator's events.
-        force: also write into a folder with other files.
-        on_step: called with the result of every step.
-        stop: asked before every step; true ends the run.
+        sim: Simulator for which the optimum was solved.
+        optimum: The optimum.
+        out: Path of the folder.
+        reached: Comparisons of controllers with the optimum.
+        seed: Seed of the simulator's events.
+        force: True allows a folder that contains other files.
+        on_step: Callback that receives the result of every step.
+        stop: Callback before every step; the run ends if it returns True.
 
     Returns:
-        Whether the whole path was run; without, there is no optimum.json.
+        True if the whole path was simulated; otherwise optimum.json is not written.
 
     Raises:
-        SdcError: as ``simulate_to_folder``.
+        SdcError: ``simulate_to_folder`` has raised it.
     """
     request = RunRequest(OPTIMUM, optimum.steps, seed)
     written = simulate_to_folder(
@@ -115,19 +117,19 @@ def write_optimum(
 
 
 def find_optimum(folder: Path, fingerprint: str, steps: int) -> tuple[Path, dict[str, Any]] | None:
-    """The optimum of a run: of its own folder, or of the folder ``optimum`` in it.
+    """Find the optimum of a run in the run's folder or in its subfolder ``optimum``.
 
     Args:
-        folder: folder of the run.
-        fingerprint: fingerprint of the run's configs and inputs.
-        steps: number of its steps.
+        folder: Folder of the run.
+        fingerprint: Fingerprint of the run's configs and inputs.
+        steps: Number of steps of the run.
 
     Returns:
-        Run folder of the achieved path, and content of optimum.json; None if there is none of
-        equal inputs and steps.
+        Run folder of the achieved path, and content of optimum.json; None if there is no optimum
+        with the same fingerprint and number of steps.
 
     Raises:
-        SdcError: an optimum.json that is damaged.
+        SdcError: An optimum.json is damaged.
     """
     for place in (folder, folder / FOLDER):
         if os.path.isfile(place / OPTIMUM_FILE):
@@ -138,10 +140,10 @@ def find_optimum(folder: Path, fingerprint: str, steps: int) -> tuple[Path, dict
 
 
 def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
-    """Explanations of the figures of an optimum, and checks that failed, in words.
+    """Return sentences that explain the values of an optimum, and its failed checks.
 
     Args:
-        content: content of optimum.json.
+        content: Content of optimum.json.
     """
     dcs = content["data_centers"]
     remarks = ["Achieved: what the simulator reached with all inputs known in advance."]
@@ -173,23 +175,23 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
 
 
 def remarks_beside(metrics: Mapping[str, Any]) -> list[str]:
-    """Reservations about the share of a run, in words: bounds that are none, limits that it breaks.
+    """Return sentences that qualify the share of a run: weak bounds, and violated constraints.
 
     Args:
-        metrics: content of metrics.json of a run beside an optimum.
+        metrics: Content of metrics.json of a run that was compared with an optimum.
     """
-    names, beside = [dc["name"] for dc in metrics["data_centers"]], metrics["optimum"]
-    kinds = zip(names, beside["bound_kinds"], strict=True)
+    names, comparison = [dc["name"] for dc in metrics["data_centers"]], metrics["optimum"]
+    kinds = zip(names, comparison["bound_kinds"], strict=True)
     remarks = [f"{name}: {kind}" for name, kind in kinds if kind != _BOUND]
     return remarks + [
         f"{name}: this run {text}, which the achieved path does not"
-        for name, texts in zip(names, beside["broken"], strict=True)
+        for name, texts in zip(names, comparison["broken"], strict=True)
         for text in texts
     ]
 
 
 def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
-    """What optimum.json says of a data center."""
+    """Return the entry of optimum.json for one data center."""
     limit_c = float(optimum.inlet_limit_c[dc])
     figures = _figures(
         {name: float(getattr(optimum, name)[dc]) for name in _FIGURES},
@@ -206,7 +208,7 @@ def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
 
 
 def _figures(figures: Mapping[str, float], alone: Mapping[str, float]) -> dict[str, Any]:
-    """Figures, and the gap between bound and achieved in % of the idle figure."""
+    """Return objective values, and the gap from bound to achieved value in % of the idle value."""
     idle, bound, achieved = (figures[name] for name in _FIGURES)
     gap = 100.0 * (achieved - bound) / idle if idle else math.nan
     return {
@@ -217,7 +219,7 @@ def _figures(figures: Mapping[str, float], alone: Mapping[str, float]) -> dict[s
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Content of an optimum.json, checked as far as reports rely on it."""
+    """Read an optimum.json, and check the fields that reports read."""
     try:
         content = load_json(read_text(path, MOST_METRICS_BYTES))
     except SdcError:
@@ -225,15 +227,15 @@ def _read(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise SdcError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise SdcError(f"{path}: format {found!r}; valid is {FORMAT!r}, solve the optimum again")
+        label = content.get("format") if isinstance(content, dict) else type(content).__name__
+        raise SdcError(f"{path}: format {label!r}; valid is {FORMAT!r}, solve the optimum again")
     kinds: dict[str, Any] = dict.fromkeys(("fingerprint", "objective", "unit"), str)
     kinds |= dict.fromkeys(("steps", "scored_from"), int) | {"total": dict}
     kinds |= dict.fromkeys(("agents", "data_centers", "controllers"), list)
     wrong = [name for name, kind in kinds.items() if not isinstance(content.get(name), kind)]
     dcs = [] if wrong else [*content["data_centers"], content["total"]]
-    whole = {"idle", "bound", "achieved", "gap_points", "alone"}
-    wrong += ["data_centers" for dc in dcs if not (isinstance(dc, dict) and whole <= set(dc))][:1]
+    keys = {"idle", "bound", "achieved", "gap_points", "alone"}
+    wrong += ["data_centers" for dc in dcs if not (isinstance(dc, dict) and keys <= set(dc))][:1]
     if wrong:
         raise SdcError(f"{path}: {wrong[0]} is missing or damaged; solve the optimum again")
     return dict(content)

@@ -1,4 +1,4 @@
-"""steps.parquet of a run folder: rows of quantities, and in its metadata racks and hottest air."""
+"""File steps.parquet of a run folder: quantities by step; metadata on racks and hottest air."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, StepResult, fields_of
 
 STEPS_FILE = "steps.parquet"
-"""Name of the file in a run folder."""
+"""Name of the steps file in a run folder."""
 METADATA_KEY = b"sdc_taichi"
-"""Key of the file's metadata under which the run is described, as JSON."""
+"""Metadata key of the description of the run, as JSON."""
 RACKS_KEY = b"sdc_taichi_racks"
-"""Key of the file's metadata for how hot each rack became, as JSON.
+"""Metadata key of rack statistics, as JSON.
 
-A list with an object for each data center: ``hottest_steps``, the number of steps in which the
-hottest inlet of each rack was that of the hall, up to ``TIE_K``, and ``inlet_max_c``, the highest
-inlet of each rack over the run, in C.
+The value is a list with one object per data center. ``hottest_steps`` is the number of steps in
+which each rack had the hottest inlet of its hall, within ``TIE_K``; ``inlet_max_c`` is the highest
+inlet temperature of each rack over the run, in C.
 """
 AIR_KEY = b"sdc_taichi_air"
-"""Key of the file's metadata for the air before the racks, as JSON: a list with
-what ``air_values`` says of each data center in its hottest step. Empty for runs of more
-than ``MOST_AIR_RACKS`` racks."""
+"""Metadata key of the air before the racks, as JSON.
+
+The value is a list with the ``air_values`` of each data center in its hottest step. It is empty for
+runs of more than ``MOST_AIR_RACKS`` racks."""
 MOST_AIR_RACKS = 20_000
-"""Most racks of a run whose air is kept."""
+"""Maximum number of racks of a run whose air is stored."""
 _DECIMALS = 6
-"""Decimals of stored air; temperatures are then right to a millionth of a kelvin."""
+"""Decimals of stored air, so that temperatures are exact to a millionth of a kelvin."""
 _MOST = 1e9
-"""Bound that no stored value of the air reaches."""
+"""Limit of the absolute value of stored air; larger values are rejected as damaged."""
 _ROWS_PER_GROUP = 1 << 16
 _RACKS_AT_A_TIME = 1 << 14
 
@@ -47,16 +48,16 @@ _RACKS_AT_A_TIME = 1 << 14
 class StepsWriter:
     """Writes one row per data center and step to a Parquet file, a row group at a time.
 
-    Memory does not grow with the number of steps. The file appears under its name on ``commit``;
-    without it, nothing is left behind.
+    Memory does not grow with the number of steps. ``commit`` gives the file its name; without
+    ``commit``, no file remains.
 
     Args:
-        path: the file.
-        sim: the simulator whose steps are added.
-        metadata: stored as JSON under ``METADATA_KEY`` in the file's metadata.
+        path: Path of the file.
+        sim: Simulator whose steps are added.
+        metadata: Description of the run, stored as JSON under ``METADATA_KEY``.
 
     Raises:
-        SdcError: the file cannot be written, or another process is writing it.
+        SdcError: The file cannot be written, or another process is writing it.
     """
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
@@ -64,7 +65,7 @@ class StepsWriter:
         self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
         self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
         self._names: tuple[str, ...] = ()
-        self._values: F64 = np.empty((0, 0, 0))  # of the row group under way, (columns, steps, B)
+        self._values: F64 = np.empty((0, 0, 0))  # Current row group, (columns, steps, B).
         self._filled = 0
         self._first_step = 0
         self._writer: Any = None
@@ -73,10 +74,10 @@ class StepsWriter:
         self._output = AtomicFile(path)
 
     def add(self, result: StepResult) -> None:
-        """Add one step, the one after the step added before.
+        """Add a step; steps must be added in order.
 
         Raises:
-            SdcError: the file cannot be written.
+            SdcError: The file cannot be written.
         """
         if not self._names:
             self._names = tuple(result.per_dc())
@@ -94,10 +95,10 @@ class StepsWriter:
             self._write_row_group()
 
     def commit(self) -> None:
-        """Finish the file and give it its name.
+        """Complete the file and give it its name.
 
         Raises:
-            SdcError: the file cannot be written.
+            SdcError: The file cannot be written.
         """
         self._write_row_group()
         tables = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
@@ -114,14 +115,14 @@ class StepsWriter:
         self._output.discard()
 
     def _air_per_dc(self) -> list[dict[str, Any]]:
-        """What ``AIR_KEY`` says, of the steps added."""
+        """Return the value for ``AIR_KEY`` from the added steps."""
         if self._air is None:
             return []
         of_dcs = map(self._air.of, range(self._fleet.size))
         return [air_values(each) for each in of_dcs if each is not None]
 
     def _write_row_group(self) -> None:
-        """Write the steps added since the last row group, if there are any."""
+        """Write the steps since the last row group, if any, as a new row group."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -150,10 +151,10 @@ class StepsWriter:
 
 
 class _RackCounts:
-    """How long each rack of a fleet had the hottest inlet of its hall, and its highest inlet.
+    """Counts the steps in which each rack has the hottest inlet, and tracks its highest inlet.
 
-    Steps are counted several at a time, because each operation on a few racks takes as long as
-    it takes on a thousand.
+    Several steps are processed at a time, because the cost of a NumPy call on a few racks is mostly
+    overhead.
     """
 
     def __init__(self, fleet: Fleet) -> None:
@@ -166,7 +167,7 @@ class _RackCounts:
         self._highest_c = np.full(fleet.racks, -np.inf)
 
     def add(self, result: StepResult) -> None:
-        """Add a step."""
+        """Add the inlet temperatures of a step."""
         self._inlet_c[self._filled] = result.rack_inlet_max_c
         self._hottest_c[self._filled] = result.inlet_max_c
         self._filled += 1
@@ -174,7 +175,7 @@ class _RackCounts:
             self._count()
 
     def per_dc(self) -> list[dict[str, list[float]]]:
-        """What ``RACKS_KEY`` says, of the steps added."""
+        """Return the value for ``RACKS_KEY`` from the added steps."""
         self._count()
         ends = self._first[1:-1]
         parts = np.split(self._steps, ends), np.split(self._highest_c.round(3), ends)
@@ -184,7 +185,7 @@ class _RackCounts:
         ]
 
     def _count(self) -> None:
-        """Count the steps that were added since the last time."""
+        """Process the steps that were added since the last call."""
         inlet_c = self._inlet_c[: self._filled]
         limit_c = self._hottest_c[: self._filled] - TIE_K
         self._steps += np.count_nonzero(inlet_c >= limit_c[:, self._rack_dc], axis=0)
@@ -197,53 +198,53 @@ class AirAtStep:
     """Air before the racks of one data center in one step."""
 
     step: int
-    """The step, counted from 0 at reset."""
+    """Index of the step, counted from 0 at reset."""
     air: IntakeAir
-    """Air before its racks."""
+    """Air before the racks of the data center."""
 
 
 class HottestAir:
-    """The air of each data center of a simulator in the first of its hottest steps.
+    """Records the air of each data center in its hottest step, the first one if several are equal.
 
     Args:
-        sim: the simulator.
-        dcs: indices of the data centers whose air is kept; None is all.
+        sim: The simulator.
+        dcs: Indices of the data centers whose air is recorded; None records all.
     """
 
     def __init__(self, sim: Simulator, dcs: Sequence[int] | None = None) -> None:
         self._sim = sim
-        # No inlet of a data center whose air is not kept is hotter.
+        # An infinite rank excludes the data centers whose air is not recorded.
         self._rank = np.full(sim.size, -np.inf if dcs is None else np.inf)
         self._rank[[] if dcs is None else list(dcs)] = -np.inf
         self._step: I64 = np.full(sim.size, -1, dtype=np.int64)
         self._air: IntakeAir | None = None
 
     def add(self, result: StepResult) -> None:
-        """Add the last step of the simulator."""
+        """Process the last step of the simulator."""
         ranks = rank(result.inlet_max_c)
         hotter = ranks > self._rank
         if not hotter.any():
             return
         self._rank[hotter] = ranks[hotter]
         self._step[hotter] = result.step
-        found = self._sim.intake_air()
+        current = self._sim.intake_air()
         if self._air is None or hotter.all():
-            self._air = found
+            self._air = current
             return
         fleet = self._sim.fleet
         for names, of in ((RACK_FIELDS, fleet.rack_dc), (UNIT_FIELDS, fleet.unit_dc)):
             for name in names:
-                np.copyto(getattr(self._air, name), getattr(found, name), where=hotter[of])
+                np.copyto(getattr(self._air, name), getattr(current, name), where=hotter[of])
 
     def of(self, dc: int) -> AirAtStep | None:
-        """The air of a data center in its hottest step; None before the first step."""
+        """Return the air of a data center in its hottest step; None before the first step."""
         if self._air is None:
             return None
         return AirAtStep(int(self._step[dc]), intake_air_of(self._sim.fleet, self._air, dc))
 
 
 def air_values(hottest: AirAtStep) -> dict[str, Any]:
-    """Air as plain values for JSON: ``step``, and a list by rack or CRAC unit for each field."""
+    """Convert air to plain values for JSON: ``step``, and for each field a list by rack or unit."""
     lists = {
         name: values.round(_DECIMALS).tolist() for name, values in fields_of(hottest.air).items()
     }
@@ -251,16 +252,16 @@ def air_values(hottest: AirAtStep) -> dict[str, Any]:
 
 
 def air_from_values(values: dict[str, Any], *, racks: int, units: int, steps: int) -> AirAtStep:
-    """Air that ``air_values`` made plain.
+    """Convert plain values of ``air_values`` back to air.
 
     Args:
-        values: the plain values.
-        racks: racks of the hall.
-        units: CRAC units of the hall.
-        steps: steps of the run.
+        values: The plain values.
+        racks: Number of racks of the hall.
+        units: Number of CRAC units of the hall.
+        steps: Number of steps of the run.
 
     Raises:
-        ValueError: values that are missing, out of range or of another number of racks or units.
+        ValueError: A value is missing or out of range, or a list has a wrong length.
     """
     step = values.get("step")
     if not isinstance(step, int) or not 0 <= step < steps:

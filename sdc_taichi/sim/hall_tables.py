@@ -1,7 +1,7 @@
 """Input arrays of the hall kernels, built once for a fleet.
 
-``kernels/README.md`` tells how halls lie in these arrays, ``kernels/hall_arguments.py`` what each
-array and row holds.
+``kernels/README.md`` describes the memory layout of these arrays; ``kernels/hall_arguments.py``
+documents each array and row.
 """
 
 from __future__ import annotations
@@ -46,15 +46,17 @@ from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
 from sdc_taichi.types import F64, I32
 
 RETURN_BAND_K = 2.0
-"""Proportional band of return-air control, in K: how much colder than the setpoint the return air
-is without load."""
+"""Proportional band of return-air control, in K: setpoint minus return temperature without load."""
 Array = Any
-"""NumPy array of any type; arrays of vectors have an axis more than in the kernel."""
+"""NumPy array of any type; an array of vectors has one more axis here than in the kernel."""
 
 
 @dataclass(frozen=True, slots=True)
 class RackPlaces:
-    """Where racks lie in the kernels' arrays: each data center fills whole blocks of LANES."""
+    """Indices (places) of racks in the kernels' arrays, where data centers fill whole blocks.
+
+    A block has ``LANES`` places; places without a rack are padding.
+    """
 
     blocks: npt.NDArray[np.int64]
     """Number of blocks of each data center, (B,)."""
@@ -63,25 +65,25 @@ class RackPlaces:
     of_racks: npt.NDArray[np.int64]
     """Place of each rack, (R,)."""
     racks_per_dc: int | None
-    """Racks of each data center where all have as many, else None."""
+    """Number of racks of each data center if it is equal for all, else None."""
 
     @property
     def count(self) -> int:
-        """Number of places, of racks and padding."""
+        """Number of places, including padding."""
         return int(LANES * self.block_offsets[-1])
 
     def values_of_racks(self, rows: Array) -> Array:
-        """Copy of rows by place, (n, places), as values of the racks, (n, R)."""
+        """Return a copy of rows by place, (n, places), as rows by rack, (n, R)."""
         rows, size = rows.reshape(len(rows), -1), len(self.blocks)
         if self.racks_per_dc is None:
             return rows[:, self.of_racks]
-        # The racks of a data center as one item, in a third of the time of one by one.
+        # Copying the racks of a data center as one item takes a third of the time of a gather.
         apart, item = rows.strides[0], np.dtype((np.void, self.racks_per_dc * rows.itemsize))
         parts: Any = np.ndarray((len(rows), size), item, rows, strides=(apart, apart // size))
         return parts.copy().view(rows.dtype)
 
     def put(self, row: Array, values: Array) -> None:
-        """Write values of the racks, (R,), to a row by place, (places,)."""
+        """Write values by rack, (R,), to a row by place, (places,)."""
         if self.racks_per_dc is None:
             row[self.of_racks] = values
         else:
@@ -91,27 +93,27 @@ class RackPlaces:
 
 @dataclass(frozen=True, slots=True)
 class HallTables:
-    """Arrays of the hall kernels for a fleet, and where its racks and groups lie in them."""
+    """Arrays of the hall kernels for a fleet, and the positions of its racks and groups in them."""
 
     places: RackPlaces
-    """Where the racks are."""
+    """Positions of the racks in the arrays."""
     arrays: dict[str, Array]
     """Arrays by the names of the kernels' arguments."""
     group_places: int
-    """Entries of arrays that have one per block and group, such as ``server_c``."""
+    """Length of arrays with one entry per block and group, such as ``server_c``."""
     slices: int
-    """Parts in which threads take on the tasks."""
+    """Number of slices into which the tasks are divided for the threads."""
     plenum: SharedPlenum
-    """Keeps ``unit_shares`` up while CRAC units are down."""
+    """Updates ``unit_shares`` when CRAC units stop or start."""
 
     def rows(self, argument: str) -> dict[str, Array]:
-        """Views of the named rows of an array of two dimensions, each flat."""
+        """Return flat views of the rows of a two-dimensional array, by row name."""
         array, rows = self.arrays[argument], ARGUMENTS[argument].rows
         return dict(zip(rows, array.reshape(len(rows), -1), strict=True))
 
 
 def vectors(dtype: npt.DTypeLike, *shape: int, lanes: int = LANES) -> Array:
-    """Zeros that the kernels take as vectors, (*shape, lanes)."""
+    """Return an aligned array of zeros that kernels can read as vectors, (*shape, lanes)."""
     from sdc_taichi.kernels.compiler.arrays import aligned
 
     out = aligned((*shape, lanes), dtype)
@@ -120,15 +122,15 @@ def vectors(dtype: npt.DTypeLike, *shape: int, lanes: int = LANES) -> Array:
 
 
 def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> HallTables:
-    """Arrays of the hall kernels for a fleet.
+    """Build the arrays of the hall kernels for a fleet.
 
     Args:
-        fleet: the data centers.
-        dtype: float32 or float64, of temperatures and powers.
-        most_slices: most parts in which threads take on the tasks.
+        fleet: The data centers.
+        dtype: Type of temperatures and powers, float32 or float64.
+        most_slices: Maximum number of slices into which the tasks are divided for the threads.
 
     Raises:
-        ConfigError: more entries than the kernels can index.
+        ConfigError: An array has more entries than the kernels can index.
     """
     places = _build_places(fleet)
     task_offsets, chunk_ints, first_chunk = _build_chunks(fleet, places, most_slices)
@@ -186,7 +188,7 @@ def _build_places(fleet: Fleet) -> RackPlaces:
     racks = np.diff(fleet.rack_offsets)
     blocks = -(-racks // LANES)
     if fleet.air is not None and racks.max() > DENSE_RACKS:
-        # Runs of weights need all halls to begin where vectors of RUN_LANES do.
+        # Runs of weights are read as vectors of RUN_LANES, so halls must begin at such a vector.
         blocks = -(-blocks // RUN_BLOCKS) * RUN_BLOCKS
     block_offsets = offsets_from_counts(blocks, "blocks of racks")
     within = np.arange(fleet.racks) - np.repeat(fleet.rack_offsets[:-1], racks)
@@ -199,11 +201,16 @@ def _build_places(fleet: Fleet) -> RackPlaces:
 
 
 def _build_chunks(fleet: Fleet, places: RackPlaces, most_slices: int) -> tuple[Array, Array, Array]:
-    """First chunk of each task and the end; rows CHUNK_INTS; first chunk of each data center."""
+    """Divide the blocks into chunks and tasks for the threads.
+
+    Returns:
+        First chunk of each task, and the number of chunks; rows ``CHUNK_INTS``; first chunk of each
+        data center, and the number of chunks.
+    """
     chunks = [np.arange(a, b, CHUNK_BLOCKS) for a, b in pairwise(places.block_offsets)]
     per_dc = np.array([len(c) for c in chunks])
     chunk_dc = np.repeat(np.arange(fleet.size), per_dc)
-    # Data centers of up to a slice are one task, larger ones a task per chunk.
+    # A data center that fits into a slice is one task; larger ones have one task per chunk.
     is_one_task = per_dc * most_slices <= max(per_dc.sum(), most_slices)
     begins_task = ~np.repeat(is_one_task, per_dc)
     begins_task[np.cumsum(per_dc) - per_dc] = True
@@ -220,14 +227,17 @@ def _build_chunks(fleet: Fleet, places: RackPlaces, most_slices: int) -> tuple[A
 def _build_groups(
     fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
 ) -> tuple[Array, Array, Array]:
-    """Rows BLOCK_INTS and PLACE_INTS, and the group inputs that equal blocks share."""
+    """Return rows ``BLOCK_INTS``, rows ``PLACE_INTS`` and the group inputs.
+
+    Blocks with equal groups share their group inputs.
+    """
     block = places.of_racks // LANES
     groups = np.diff(fleet.group_offsets)
     most = np.zeros(int(places.blocks.sum()), np.int64)
     np.maximum.at(most, block, groups)
     racks = np.bincount(block, minlength=len(most))
     first_rack = np.cumsum(racks) - racks
-    # Padding, and the closing entry, begin where the rack before them ends.
+    # Padding and the closing entry have the first group that follows the last rack before them.
     rack = np.minimum(np.arange(LANES), racks[:, None]) + first_rack[:, None]
     first_group = fleet.group_offsets[np.append(rack, fleet.racks)]
     first_row, group_inputs = _build_group_inputs(fleet, places, first_rack, racks, most, dtype)
@@ -254,7 +264,10 @@ def _build_group_inputs(
     groups: Array,
     dtype: npt.DTypeLike,
 ) -> tuple[Array, Array]:
-    """First entry of each block, and the entries: rows GROUP_INPUTS by group, lanes racks."""
+    """Return the first entry of each block, and the entries of all distinct blocks.
+
+    An entry holds the rows ``GROUP_INPUTS`` of one group of each rack, with racks as lanes.
+    """
     known: dict[Any, int] = {}
     blocks_of_hall: dict[int, slice] = {}
     entries, first_row, total = [], np.zeros(len(groups), np.int64), 0
@@ -283,18 +296,18 @@ def _build_group_inputs(
 
 
 def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -> Array:
-    """Group inputs of a block, (groups, rows, LANES).
+    """Return the group inputs of a block, (groups, rows, LANES).
 
     For a block of two racks with 2 and 3 groups, ``offsets`` is [0, 2, 5]. Entry 0 holds groups 0
     and 2 in its first two lanes, entry 1 groups 1 and 3, and entry 2 groups 1 and 4: the first rack
-    has no third group and repeats its last one, with a count of 0. The other lanes repeat the
-    second, also with a count of 0.
+    has no third group and repeats its last group with a server count of 0. The remaining lanes
+    repeat the second lane, also with a server count of 0.
 
     Args:
-        rows: rows GROUP_INPUTS of the groups of the hall.
-        offsets: first group of each rack of the block, and the end of the last one.
-        groups: most groups of a rack of the block.
-        dtype: type of the entry.
+        rows: Rows ``GROUP_INPUTS`` of the groups of the hall.
+        offsets: First group of each rack of the block, and the end of the last rack.
+        groups: Maximum number of groups of a rack of the block.
+        dtype: Type of the result.
     """
     number, counts, n_racks = np.arange(groups)[:, None], np.diff(offsets), len(offsets) - 1
     group = offsets[:-1] + np.minimum(number, counts - 1)
@@ -308,16 +321,16 @@ def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -
 
 
 def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Array, Array]:
-    """Group inputs with the same values once more, LANES groups of one rack at a time.
+    """Append a transposed copy of the group inputs, with LANES groups of one rack per entry.
 
-    The entries of a block have racks as lanes: entry k holds group k of each rack. For the values
-    of single servers, the kernel of layers reads groups along a rack instead. Each block is
+    In the original entries of a block, lanes are racks: entry k holds group k of each rack. The
+    layers kernel computes single servers and needs lanes that are groups of one rack. Each block is
     therefore cut into squares of LANES groups by LANES racks, and each square is transposed: a
-    block of 20 groups becomes 3 vectors of groups for each of its 8 racks, the last filled up with
-    repeats of group 19.
+    block of 20 groups becomes 3 vectors of groups for each of its 8 racks, and the last vector is
+    padded with repeats of group 19.
 
     Returns:
-        The longer group inputs, and the first entry along the racks of each block.
+        The extended group inputs, and the first transposed entry of each block.
     """
     block = dict(zip(BLOCK_INTS, block_ints, strict=True))
     entries = group_inputs.reshape(-1, len(GROUP_INPUTS), LANES)
@@ -340,7 +353,10 @@ def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Arra
 def _build_air(
     fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
 ) -> tuple[Array, Array, Array]:
-    """Unit shares and weights of dense halls by block, and the first weight of each hall."""
+    """Return unit shares by block, mix weights of dense halls, and each hall's first weight.
+
+    The first weight is -1 for sparse halls, whose weights are in runs (see ``_build_runs``).
+    """
     first_mix_weight = np.full(fleet.size + 1, -1)
     air = fleet.air
     if air is None:
@@ -353,7 +369,7 @@ def _build_air(
         at = air.unit_share_offsets[dc]
         shares_of_hall = air.unit_shares[at : at + racks * units].reshape(racks, units)
         shares.append(shares_by_block(shares_of_hall, LANES))
-        # Sparse halls fill up to whole vectors of RUN_LANES with blocks of padding.
+        # Sparse halls are padded with blocks of zeros to whole vectors of RUN_LANES.
         shares.append(np.zeros((n_places // LANES * units - len(shares[-1]), LANES)))
         if racks > DENSE_RACKS:
             continue
@@ -376,7 +392,7 @@ def _build_air(
 
 
 def _dense_weights(fleet: Fleet, dc: int) -> F64:
-    """Mix before every rack of a data center from the exhausts of all its racks, (R, R)."""
+    """Return the mix weights of a data center as a matrix, receiving by source rack, (R, R)."""
     assert fleet.air is not None
     weights = fleet.air.mix_weights
     first, end = fleet.rack_offsets[dc : dc + 2]
@@ -393,7 +409,11 @@ def _dense_weights(fleet: Fleet, dc: int) -> F64:
 def _build_steady_states(
     fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
 ) -> tuple[Array, dict[str, Array]]:
-    """Patterns of each distinct hall by block, then its table; rows of DC_INTS that find both."""
+    """Return the steady-state tables of all distinct halls, and the index rows of ``DC_INTS``.
+
+    For each hall, the array holds first its temperature patterns by block, then the table of the
+    pattern amplitudes.
+    """
     names = ("first_pattern", "first_steady_state", "supply_rows")
     air = fleet.air
     if air is None:
@@ -413,7 +433,7 @@ def _build_steady_states(
         amounts = np.zeros((*table.feedback_gain.shape, LANES))
         amounts[..., : table.pattern_shares.shape[2]] = table.pattern_shares
         amounts[..., MIX_PATTERNS] = table.feedback_gain
-        # Cubics reach one row and column beyond.
+        # Cubic interpolation reads one row and column beyond the table on each side.
         beyond = ((1, 1), (1, 1), (0, 0))
         amounts = np.pad(amounts, beyond, mode="reflect", reflect_type="odd")
         by_block = patterns.reshape(-1, int(blocks), LANES).swapaxes(0, 1).reshape(-1, LANES)
@@ -427,7 +447,7 @@ def _build_steady_states(
 
 
 def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[str, Array]:
-    """Runs of weights of sparse halls in whole vectors, filled up with zeros."""
+    """Return the runs of mix weights of sparse halls, padded with zeros to whole vectors."""
     air = fleet.air
     run_counts = np.zeros(places.count, np.int64)
     is_sparse = np.diff(fleet.rack_offsets)[fleet.rack_dc] > DENSE_RACKS
@@ -445,7 +465,7 @@ def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[
     first = (mix_weights.run_first_rack + np.repeat(moved[fleet.rack_dc], counts))[of_sparse]
     length = mix_weights.run_length[of_sparse]
     offset = mix_weights.run_first_weight[of_sparse].astype(np.int64)
-    # Runs that share weights share their vectors where they begin at the same lane.
+    # Runs with equal weights share vectors if they begin at the same lane.
     lane = first % RUN_LANES
     key = (offset * (int(length.max()) + 1) + length) * RUN_LANES + lane
     _, one, same = np.unique(key, return_index=True, return_inverse=True)
@@ -470,7 +490,7 @@ def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[
 
 
 def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> Array:
-    """Rows RACK_INPUTS by place; loads are set in every step."""
+    """Return the rows ``RACK_INPUTS`` by place; every step overwrites the loads."""
     air, ones = fleet.air, np.ones(fleet.racks)
     values = {
         "approach_k": fleet.approach_k,
@@ -491,7 +511,10 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
 
 
 def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
-    """Rows of DC_DOUBLES that stay the same in all steps, but for the fans of transient halls."""
+    """Set the constant rows of ``DC_DOUBLES``.
+
+    Of these, only ``crac_fan_w_per_m3s`` is overwritten later, in steps of transient halls.
+    """
     dc["crac_fan_w_per_m3s"][:] = fleet.values("hvac.crac.fan_w_per_m3s")
     follows = fleet.models["crac_flow"] == "hottest_inlet"
     dc["inlet_target_c"][:] = fleet.values("hvac.crac.inlet_target_c") * follows
@@ -509,7 +532,7 @@ def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
 
 
 def _index_rows(rows: Any, values: dict[str, Any]) -> npt.NDArray[np.int32]:
-    """Rows of indices by name, those without a closing entry filled up with 0."""
+    """Stack rows of indices in their order, padding rows without a closing entry with 0."""
     ordered = in_row_order(rows, values)
     out = np.zeros((len(rows), max(map(len, ordered))), np.int32)
     for row, value in zip(out, ordered, strict=True):

@@ -1,16 +1,18 @@
-"""Why the inlet of a rack is as warm as it is: its temperature as a sum of parts.
+"""Causes of inlet temperatures: the inlet temperature of a rack as an exact sum of parts.
 
-With T_sup the supply air that reaches rack j, T_mix = sum_i w_ji X_i the exhaust mix before it, X_i
-what rack i gives to the mixes, f_k the share of its racks' need that CRAC unit k covers, s_jk the
-unit's share in their supply air, r_j the rack's exhaust share and g the height factor of a server,
+Symbols: T_sup is the temperature of the supply air that reaches rack j, X_i the exhaust
+temperature of rack i, w_ji its weight in the exhaust mix before rack j, and T_mix = sum_i w_ji X_i
+the temperature of this mix. CRAC unit k covers the share f_k of the supply air that its racks
+demand and has the share s_jk in the supply of rack j. r_j is the exhaust share of rack j, and g the
+height factor of a server. Then
 
-    e     = 1 - (1 - r_j g) sum_k s_jk f_k       share of the server's intake that is exhaust
+    e     = 1 - (1 - r_j g) sum_k s_jk f_k       share of exhaust air in the server's intake
     T_in  = T_sup + e (T_mix - T_sup) = setpoint + (T_sup - setpoint) + sum_i e w_ji (X_i - T_sup)
     e     = r_j + r_j (g - 1) + (1 - r_j g) (1 - sum_k s_jk f_k)
 
-The second line says whose exhaust warms the inlet by how much; the third says whether it reaches
-the inlet by the layout, by the height of the server, or because the units fall short of the need
-(equations of docs/hall.md). Both are sums without a remainder.
+The second line splits the inlet temperature by the rack whose exhaust causes it. The third line
+splits the exhaust share into the effects of the layout, of the server's height, and of CRAC units
+that supply less than the racks demand (equations of docs/hall.md). Neither sum has a remainder.
 """
 
 from __future__ import annotations
@@ -30,33 +32,33 @@ from sdc_taichi.types import F64, fields_of
 
 @dataclass(frozen=True, slots=True)
 class IntakeAir:
-    """Air before the racks of a fleet with R racks and U CRAC units at one moment.
+    """Air before the racks of a fleet with R racks and U CRAC units after a step.
 
-    Of quasi-steady halls in the last step, of transient halls at its end; ``airflow_m3s``,
-    ``power_w``, ``outlet_c`` and ``unit_m3s`` are means over the step.
+    In transient halls, values are those at the end of the step, except ``airflow_m3s``,
+    ``power_w``, ``outlet_c`` and ``unit_m3s``, which are means over the step.
     """
 
     mixed_c: F64
-    """Recirculated air before each rack, in C, (R,)."""
+    """Temperature of the recirculated air before each rack, in C, (R,)."""
     exhaust_c: F64
-    """Temperature that each rack gives to the exhaust mixes, in C, (R,): its outlet, and for the
-    share of its air that failing fans do not move the mix before it."""
+    """Exhaust temperature of each rack, in C, (R,): that of its outlet, mixed with ``mixed_c`` for
+    the airflow that failed fans lack."""
     airflow_m3s: F64
     """Airflow through each rack, in m3/s, (R,)."""
     power_w: F64
-    """Power of each rack with its fans, in W, (R,)."""
+    """Power of each rack including its fans, in W, (R,)."""
     outlet_c: F64
-    """Outlet of each rack, in C, (R,)."""
+    """Outlet temperature of each rack, in C, (R,)."""
     fan_airflow: F64
-    """Share of their airflow left to the fans of each rack, 0..1, (R,)."""
+    """Remaining airflow of each rack's fans as a share of full airflow, 0..1, (R,)."""
     powered: F64
-    """Share of the step that each rack is on, 0..1, (R,)."""
+    """Share of the step during which each rack is on, 0..1, (R,)."""
     setpoint_c: F64
     """Supply air setpoint of each CRAC unit, in C, (U,)."""
     supply_c: F64
-    """Supply air of each CRAC unit, in C, (U,)."""
+    """Supply temperature of each CRAC unit, in C, (U,)."""
     fresh_ratio: F64
-    """Share of its racks' need for supply air that each CRAC unit covers, 0..1, (U,)."""
+    """Share of the demanded supply airflow that each CRAC unit covers, 0..1, (U,)."""
     unit_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
     unit_weight: F64
@@ -70,13 +72,13 @@ RACK_FIELDS = tuple(f.name for f in fields(IntakeAir) if f.name not in UNIT_FIEL
 
 
 def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c: F64) -> IntakeAir:
-    """Air before the racks from the arrays of the kernels after a step.
+    """Read the air before the racks from the arrays of the kernels after a step.
 
     Args:
-        tables: arrays of the kernels.
-        rack_out: rows RACK_OUT by place.
-        exhaust: what racks gave to the mixes in the last sweep, times their strength, by place.
-        setpoint_c: supply setpoint of each CRAC unit, in C, (U,).
+        tables: Arrays of the kernels.
+        rack_out: Rows ``RACK_OUT`` by place.
+        exhaust: Exhaust temperature times strength of each rack in the last sweep, by place.
+        setpoint_c: Supply setpoint of each CRAC unit, in C, (U,).
     """
     out = dict(zip(RACK_OUT, rack_out.reshape(len(RACK_OUT), -1), strict=True))
     rack, unit = tables.rows("rack_inputs"), tables.rows("unit_state")
@@ -102,7 +104,7 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
 
 
 def intake_air_of(fleet: Fleet, air: IntakeAir, dc: int) -> IntakeAir:
-    """The part of ``air`` that belongs to one data center of a fleet."""
+    """Return the part of ``air`` that belongs to data center ``dc`` of a fleet."""
     racks = slice(fleet.rack_offsets[dc], fleet.rack_offsets[dc + 1])
     units = slice(fleet.unit_offsets[dc], fleet.unit_offsets[dc + 1])
     parts = {name: getattr(air, name)[racks] for name in RACK_FIELDS}
@@ -110,101 +112,102 @@ def intake_air_of(fleet: Fleet, air: IntakeAir, dc: int) -> IntakeAir:
 
 
 LISTED_SOURCES = 5
-"""Racks whose exhaust is listed by name; that of the others is summed."""
+"""Number of other racks whose exhaust is listed by name; the remaining exhaust is summed."""
 HOTTEST_RACKS = 5
-"""Racks whose inlets reports and recordings explain."""
+"""Number of racks whose inlet temperatures reports and recordings explain."""
 LISTED_UNITS = 8
-"""CRAC units that are described, those that give most."""
+"""Number of CRAC units that are described, those with the largest shares."""
 LEAST_K = 0.005
-"""Least part of an inlet, of either sign, that is put into words, in K."""
+"""Minimum absolute size of a temperature part that texts mention, in K."""
 LEAST_SHARE = 0.0005
-"""Least share of a CRAC unit in the supply air of a rack that is put into words."""
+"""Minimum share of a CRAC unit in the supply air of a rack that texts mention."""
 _HEIGHT_ROW = list(GROUP_INPUTS).index("height_factor")
 _OFFSET_ROW = list(GROUP_INPUTS).index("inlet_offset_k")
 
 
 @dataclass(frozen=True, slots=True)
 class InletParts:
-    """The inlet of the hottest server of a rack, in a hall of R racks and U CRAC units, as a sum.
+    """Inlet temperature of a rack's hottest server, split into parts; R racks, U CRAC units.
 
-    ``inlet_c`` is the sum of ``setpoint_c``, ``warming_k``, ``approach_k``, ``exhaust_k`` over the
-    racks and ``lag_k``. ``layout_k``, ``height_k`` and ``shortfall_k`` add up to the last two.
+    ``inlet_c`` is the sum of ``setpoint_c``, ``warming_k``, ``approach_k``, all entries of
+    ``exhaust_k``, and ``lag_k``. The parts ``layout_k``, ``height_k`` and ``shortfall_k`` split the
+    sum of ``exhaust_k`` and ``lag_k`` in another way.
     """
 
     rack: int
-    """The rack, counted from 0 in its hall."""
+    """Index of the rack, counted from 0 in its hall."""
     server: int
-    """The server, counted from 0 at the floor of its rack; the first of those that are alike."""
+    """Index of the server, counted from 0 at the floor of its rack; the lowest of equal ones."""
     servers: int
-    """Servers of the rack."""
+    """Number of servers of the rack."""
     inlet_c: float
     """Inlet temperature of the server, in C."""
     setpoint_c: float
-    """Setpoint of the supply air that reaches the rack, mean over its units by what they give, in
-    C; with control of the return air the coldest supply air that its setpoint admits."""
+    """Setpoint of the supply air that reaches the rack, in C, mean over the CRAC units weighted by
+    their supply; with control of the return air, the coldest supply temperature instead."""
     controls_return: bool
-    """Whether the CRAC units control the return air."""
+    """True if the setpoints of the CRAC units are those of the return air."""
     warming_k: float
-    """Temperature of that supply air over its setpoint, in K: what the coils do not cool."""
+    """Supply temperature at the rack minus ``setpoint_c``, in K, due to insufficient cooling."""
     approach_k: float
-    """Approach temperature of the rack and offset of the server as the config gives them, in K; 0
-    where the air of the hall recirculates."""
+    """Configured approach temperature of the rack plus offset of the server, in K; 0 with inlet
+    model ``recirculation``."""
     exhaust_k: F64
-    """What the exhaust of each rack of the hall adds to the inlet, in K, (R,); 0 without
-    recirculation."""
+    """Contribution of the exhaust of each rack of the hall to the inlet temperature, in K, (R,); 0
+    with inlet model ``approach``."""
     lag_k: float
-    """What the room air before the rack is warmer than the exhausts that flow into it, times the
-    share that the server takes in, in K; round-off in quasi-steady halls."""
+    """Contribution of the thermal lag of the room air before the rack, which is warmer or colder
+    than the mix of current exhausts, in K; only round-off in quasi-steady halls."""
     exhaust_share: float
-    """Share of the server's intake that is exhaust air, 0..1."""
+    """Share of exhaust air in the server's intake, 0..1."""
     layout_k: float
-    """What exhaust air adds where a server of the mean height gets the supply air it asks for, in
-    K."""
+    """Contribution of the exhaust share that the layout causes at mean server height, in K."""
     height_k: float
-    """What the height of the server in its rack adds, in K; below 0 near the floor."""
+    """Contribution of the server's height in its rack, in K; negative near the floor."""
     shortfall_k: float
-    """What exhaust air adds in place of supply air that the CRAC units do not give, in K."""
+    """Contribution of the exhaust air that replaces missing supply air of the CRAC units, in K."""
     containment: float
-    """Share of the paths between exhausts and inlets that containment closes, 0..1."""
+    """Share of the air paths between exhausts and inlets that containment closes, 0..1."""
     contained_k: float | None
-    """What containment keeps from the inlet at the same exhaust temperatures, in K; None where it
-    closes every path."""
+    """Reduction of the inlet temperature by containment at the same exhaust temperatures, in K;
+    None if containment closes every path."""
     airflow_m3s: float
     """Airflow through the rack, in m3/s."""
     power_w: float
-    """Power of the rack with its fans, in W."""
+    """Power of the rack including its fans, in W."""
     outlet_c: float
-    """Outlet of the rack, in C."""
+    """Outlet temperature of the rack, in C."""
     fan_airflow: float
-    """Share of its airflow left to the fans of the rack, 0..1; below 1 where they fail."""
+    """Remaining airflow of the rack's fans as a share of full airflow, 0..1; below 1 if fans
+    fail."""
     powered: float
-    """Share of the step that the rack is on, 0..1."""
+    """Share of the step during which the rack is on, 0..1."""
     unit_share: F64
     """Share of each CRAC unit in the supply air that reaches the rack, 0..1, (U,)."""
     unit_supply_c: F64
-    """Supply air of each CRAC unit, in C, (U,)."""
+    """Supply temperature of each CRAC unit, in C, (U,)."""
     unit_fresh_ratio: F64
-    """Share of its racks' need for supply air that each CRAC unit covers, 0..1, (U,)."""
+    """Share of the demanded supply airflow that each CRAC unit covers, 0..1, (U,)."""
     unit_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
 
     @property
     def supply_c(self) -> float:
-        """Supply air that reaches the rack, in C."""
+        """Temperature of the supply air that reaches the rack, in C."""
         return self.setpoint_c + self.warming_k
 
     @property
     def rise_k(self) -> float:
-        """Inlet over the supply air that reaches the rack, in K."""
+        """Inlet temperature minus the temperature of the supply air that reaches the rack, in K."""
         return self.inlet_c - self.supply_c
 
     @property
     def own_exhaust_k(self) -> float:
-        """What the rack's own exhaust adds to its inlet, in K."""
+        """Contribution of the rack's own exhaust to its inlet temperature, in K."""
         return float(self.exhaust_k[self.rack])
 
     def sources(self, most: int = LISTED_SOURCES) -> list[tuple[int, float]]:
-        """Other racks whose exhaust adds most to the inlet, and by how many K, the most first."""
+        """Return the other racks with the largest contributions, as (rack, K), largest first."""
         others_k = self.exhaust_k.copy()
         others_k[self.rack] = -np.inf
         order = np.argsort(-rank(others_k), kind="stable")[: min(most, len(others_k) - 1)]
@@ -212,12 +215,12 @@ class InletParts:
 
 
 class Inlets:
-    """The inlets of one data center of a fleet, from the air before its R racks.
+    """Explains the inlet temperatures of one data center from the air before its R racks.
 
     Args:
-        fleet: the data centers.
-        dc: index of the data center.
-        air: air before its racks.
+        fleet: The data centers.
+        dc: Index of the data center.
+        air: Air before the racks of this data center.
     """
 
     def __init__(self, fleet: Fleet, dc: int, air: IntakeAir) -> None:
@@ -239,13 +242,13 @@ class Inlets:
         self._group_inlet_c = self._group_inlets()
 
     def hottest(self, most: int) -> list[int]:
-        """The racks with the hottest inlets, hottest first."""
+        """Return the indices of the ``most`` racks with the hottest inlets, hottest first."""
         hottest_c = np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1])
         order = np.argsort(-rank(hottest_c), kind="stable")
         return [int(rack) for rack in order[:most]]
 
     def parts(self, rack: int) -> InletParts:
-        """The inlet of the hottest server of a rack as a sum of parts."""
+        """Split the inlet temperature of a rack's hottest server into parts."""
         air, fleet = self._air, self._fleet
         first, end = self._group_offsets[rack : rack + 2]
         group = int(first + np.argmax(rank(self._group_inlet_c[first:end])))
@@ -254,7 +257,7 @@ class Inlets:
         shares = self._shares[rack]
         covered = shares * air.fresh_ratio
         cover = float(covered.sum())
-        # Where no unit gives anything, the supply air is what their shares would make it.
+        # If no unit supplies air, the configured shares define a nominal supply temperature.
         unit_share = covered / cover if cover > 0.0 else shares
         setpoint_c = float(unit_share @ air.setpoint_c)
         supply_c = float(unit_share @ air.supply_c)
@@ -292,12 +295,12 @@ class Inlets:
         return self._with_exhaust(plain, cover, float(self._group_rows[_HEIGHT_ROW, group]))
 
     def _with_exhaust(self, plain: InletParts, cover: float, height: float) -> InletParts:
-        """Parts with what exhaust air adds.
+        """Add the contributions of exhaust air.
 
         Args:
-            plain: parts without it.
-            cover: share of the rack's need for supply air that the units cover.
-            height: height factor of the server.
+            plain: Parts without exhaust air.
+            cover: Share of the rack's demand for supply air that the units cover.
+            height: Height factor of the server.
         """
         assert self._fleet.air is not None
         rack, supply_c, closed = plain.rack, plain.supply_c, plain.containment
@@ -323,7 +326,7 @@ class Inlets:
         )
 
     def _group_inlets(self) -> F64:
-        """Inlet of every server group of the data center, in C, (G,)."""
+        """Compute the inlet temperature of every server group of the data center, in C, (G,)."""
         air, counts = self._air, np.diff(self._group_offsets)
         if self._fleet.air is None:
             first = self._first_rack
@@ -337,13 +340,13 @@ class Inlets:
 
 
 def inlet_terms(parts: InletParts, racks_per_row: int) -> list[tuple[str, float]]:
-    """The sum that an inlet temperature is, in words: from C of the setpoint, each term in K.
+    """Return the parts of an inlet temperature with texts: first the setpoint in C, then K.
 
-    Parts that are 0 but for round-off are left out.
+    Parts smaller than ``LEAST_K`` are omitted.
 
     Args:
-        parts: the inlet.
-        racks_per_row: racks in each row of the hall.
+        parts: The parts of the inlet temperature.
+        racks_per_row: Number of racks in each row of the hall.
     """
     listed = parts.sources()
     others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k - sum(k for _, k in listed)
@@ -363,7 +366,7 @@ def inlet_terms(parts: InletParts, racks_per_row: int) -> list[tuple[str, float]
 
 
 def exhaust_terms(parts: InletParts) -> list[tuple[str, float]]:
-    """Why exhaust air reaches an inlet, in words, each term in K."""
+    """Return the reasons why exhaust air reaches an inlet, as texts with contributions in K."""
     terms = [
         ("by the layout, at mean height", parts.layout_k),
         (f"by the height of server {parts.server} of {parts.servers}", parts.height_k),
@@ -373,7 +376,7 @@ def exhaust_terms(parts: InletParts) -> list[tuple[str, float]]:
 
 
 def state_texts(parts: InletParts) -> list[str]:
-    """Containment, CRAC units and fans of a rack, in words."""
+    """Describe containment, CRAC units and fans of a rack in sentences."""
     texts = []
     if parts.containment > 0:
         kept_out = (
@@ -401,12 +404,15 @@ def state_texts(parts: InletParts) -> list[str]:
 
 
 def rack_text(rack: int, racks_per_row: int) -> str:
-    """A rack in words, with its row and its place in it."""
+    """Return the text for a rack: its index, its row and its place in the row."""
     row, place = divmod(rack, racks_per_row)
     return f"rack {rack} (row {row}, place {place})"
 
 
 def inlet_values(parts: InletParts) -> dict[str, Any]:
-    """An inlet as plain values for JSON; units are in the keys, lists are by rack or CRAC unit."""
+    """Convert the parts of an inlet temperature to plain values for JSON.
+
+    Keys name the units; lists are by rack or CRAC unit.
+    """
     values = fields_of(parts) | {"supply_c": parts.supply_c, "rise_k": parts.rise_k}
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}

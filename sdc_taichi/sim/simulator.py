@@ -1,4 +1,4 @@
-"""The simulator: one step is one pass through the stages, for all data centers at once."""
+"""The simulator: each step runs all stages once, for all data centers together."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult, join
 
 
 class Simulator:
-    """Data centers that step together.
+    """Simulates one or many data centers together, step by step.
 
     Args:
         fleet: A fleet, one config or several.
-        drivers: Exogenous inputs; None reads what the configs name.
-        precision: Of the server kernels; sums and all other stages are f64.
+        drivers: Exogenous inputs; None reads the inputs that the configs name.
+        precision: Precision of the server kernels; sums and all other stages use f64.
 
     Raises:
-        SdcError: A config or input that is not valid.
+        SdcError: A config or input is not valid.
     """
 
     def __init__(
@@ -83,10 +83,10 @@ class Simulator:
 
     @property
     def drivers(self) -> Drivers:
-        """Exogenous inputs; their ``start`` is the first step of the present run.
+        """Exogenous inputs; their ``start`` is the first step of the current run.
 
         Raises:
-            RuntimeStateError: after ``close``.
+            RuntimeStateError: The simulator is closed.
         """
         self._check_open()
         assert self._drivers is not None
@@ -97,7 +97,7 @@ class Simulator:
         """State before the next step.
 
         Raises:
-            RuntimeStateError: before ``reset``, or after ``close``.
+            RuntimeStateError: The simulator has not been reset or is closed.
         """
         if self._state is None:
             self._check_open()
@@ -106,7 +106,7 @@ class Simulator:
 
     @property
     def sizing(self) -> Sizing:
-        """Sized devices; sizes them on first use."""
+        """Sized devices; the first access sizes them."""
         return self._started().sizing
 
     def reset(
@@ -115,23 +115,23 @@ class Simulator:
         start: I64 | None = None,
         drivers: Drivers | None = None,
     ) -> State:
-        """Go back to the first step.
+        """Start a new run at its first step.
 
         Args:
-            seed: Decides the sampled events, an integer of 0..2**63 - 1, or one for each data
-                center; None is 0. Data centers of different names meet different events with one
-                seed; of those that share a name, the first takes an integer as it is, the others
-                seeds that are drawn from it. The stages are deterministic.
-            start: Index of the first step in the year, 0 to ``LAST_START``, (B,); None is the start
-                of the drivers.
-            drivers: Inputs from here on; None keeps those that there are. Devices stay as they were
-                sized with the first ones.
+            seed: Seed of the sampled events, an integer of 0..2**63 - 1, or one integer per data
+                center; None means 0. With a single seed, data centers with different names have
+                different events. Of data centers with equal names, the first uses the seed itself,
+                and the others use seeds drawn from it. All stages are deterministic.
+            start: First step of the run, counted from the beginning of the year, 0 to
+                ``LAST_START``, (B,); None uses the start of the drivers.
+            drivers: New inputs; None keeps the current inputs. Devices keep the sizes that they got
+                with the first inputs.
 
         Returns:
             The initial state.
 
         Raises:
-            ConfigError: A seed, start or drivers that are not valid.
+            ConfigError: Seed, start or drivers are not valid.
         """
         seeds = self._seeds(0 if seed is None else seed)
         inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
@@ -149,22 +149,22 @@ class Simulator:
         return self.state
 
     def _initial_state(self, seeds: I64, drivers: Drivers) -> State:
-        """The state before the first step; see ``reset``."""
+        """Return the state before the first step; see ``reset``."""
         return self._started().initial_state(self.fleet, seeds, drivers)
 
     def step(self, actions: Actions | None = None) -> StepResult:
         """Advance all data centers by one step.
 
         Args:
-            actions: Named commands; None is neutral load, held or scheduled setpoint, idle battery.
+            actions: Commands; None means neutral load, held or scheduled setpoint, idle battery.
 
         Raises:
-            PhysicalLimitError: A result that no data center can reach; the state is as before.
-            RuntimeStateError: Before ``reset``, after ``close``, or in a forked child.
-            SdcError: A command that is not finite, out of range or of the wrong shape.
+            PhysicalLimitError: A result is physically impossible; the state does not change.
+            RuntimeStateError: The simulator is not reset or is closed, or runs in a forked process.
+            SdcError: A command is not finite, out of range or of the wrong shape.
         """
         state, stages = self.state, self._started()
-        # Another user of Taichi may have ended the runtime; a forked child has none.
+        # Other code may have reset the Taichi runtime, and a forked process has no runtime.
         runtime.ensure_started()
         commands = stages.decoder.decode(actions)
         exogenous = self.drivers.at(state.step)
@@ -192,45 +192,45 @@ class Simulator:
         return result
 
     def active_events(self, step: int) -> list[ActiveEvent]:
-        """Events that cover step ``step`` of the present run."""
+        """Return the events that cover step ``step`` of the current run."""
         return self._timeline.active(step)
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
-        """Inlet, outlet and power of every server in the last step, each (S,).
+        """Return inlet, outlet and power of every server in the last step, (S,) each.
 
         Args:
             into: Layers to overwrite and return; None allocates new ones.
 
         Raises:
-            RuntimeStateError: Before the first step.
-            SdcError: Layers of another shape, type or order, or that may not be written.
+            RuntimeStateError: No step has been done.
+            SdcError: ``into`` has a wrong shape, type or memory order, or is read-only.
         """
         return self._started().hall.servers(into)
 
     def server_groups(self) -> ServerLayers:
-        """Inlet, outlet and power of one server of each group in the last step, each (G,).
+        """Return inlet, outlet and power of one server of each group in the last step, (G,) each.
 
-        Servers of a group are alike. The next step or call overwrites the layers.
+        All servers of a group have equal values. The next step or call overwrites the arrays.
 
         Raises:
-            RuntimeStateError: Before the first step.
+            RuntimeStateError: No step has been done.
         """
         return self._started().hall.groups()
 
     def intake_air(self) -> IntakeAir:
-        """Air before the racks in the last step, from which ``Inlets`` explains inlet temperatures.
+        """Return the air before the racks in the last step, the input of ``Inlets``.
 
         Raises:
-            RuntimeStateError: Before the first step.
+            RuntimeStateError: No step has been done.
         """
         stages = self._started()
         return stages.hall.intake_air(stages.crac_units.coldest_supply_c(self.state.setpoint_c))
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
-        """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.
+        """Return a state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.
 
         Args:
-            state: One of this simulator's; None is the present one.
+            state: A state of this simulator; None uses the current state.
         """
         return snapshot.to_dict(self.state if state is None else state, self.fingerprint())
 
@@ -238,21 +238,21 @@ class Simulator:
         """Continue from a ``state_dict`` of a simulator with the same fleet, inputs and precision.
 
         Args:
-            values: The state.
-            drivers: Inputs from here on; None keeps those that there are.
+            values: The return value of ``state_dict``.
+            drivers: New inputs; None keeps the current inputs.
 
         Raises:
-            SdcError: The snapshot is of another version or fleet, incomplete, or not valid; nothing
-                has changed.
+            SdcError: The snapshot is of another version or fleet, incomplete, or not valid; the
+                simulator does not change.
         """
         self.continue_from(self.read_state(values, drivers), drivers)
 
     def read_state(self, values: Mapping[str, Any], drivers: Drivers | None = None) -> State:
-        """The state that a ``state_dict`` holds, checked; the present one stays.
+        """Check a ``state_dict`` and return its state, without changing the simulator.
 
         Args:
-            values: The state.
-            drivers: Inputs it was made with; None is the present ones.
+            values: The return value of ``state_dict``.
+            drivers: Inputs with which it was created; None means the current inputs.
 
         Raises:
             SdcError: The snapshot is of another version or fleet, incomplete, or not valid.
@@ -265,11 +265,12 @@ class Simulator:
         return snapshot.to_state(values, like)
 
     def continue_from(self, state: State | None, drivers: Drivers | None = None) -> None:
-        """Continue from a state of this simulator; None is that before the first ``reset``.
+        """Continue from a state of this simulator.
 
         Args:
-            state: What ``read_state`` returned, or ``state`` was before.
-            drivers: Inputs from here on; None keeps those that there are.
+            state: Return value of ``read_state``, or an earlier value of ``state``; None makes the
+                simulator as it was before the first ``reset``.
+            drivers: New inputs; None keeps the current inputs.
         """
         inputs = self.drivers if drivers is None else self._checked_drivers(drivers)
         self._started().hall.discard_last_step()
@@ -279,7 +280,7 @@ class Simulator:
             self._drivers = replace(inputs, start=state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state to an .npz file, atomically and without pickle.
+        """Write the current state to an .npz file, atomically and without pickle.
 
         Raises:
             SdcError: The file cannot be written.
@@ -287,7 +288,7 @@ class Simulator:
         snapshot.write(path, self.state_dict())
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continue from a file of ``save``.
+        """Continue from the state in a file of ``save``.
 
         Raises:
             SdcError: The file cannot be read or is no snapshot of this fleet.
@@ -295,10 +296,10 @@ class Simulator:
         self.load_state_dict(snapshot.read(path))
 
     def fingerprint(self, drivers: Drivers | None = None) -> str:
-        """SHA-256 of configs, inputs and precision, which tells simulators apart.
+        """Return the SHA-256 of configs, inputs and precision, which identifies a simulator.
 
         Args:
-            drivers: Inputs; None is the present ones.
+            drivers: Inputs; None means the current inputs.
         """
         return snapshot.fingerprint(
             self.fleet,
@@ -307,7 +308,7 @@ class Simulator:
         )
 
     def close(self) -> None:
-        """Release state, inputs and kernel arrays; a closed simulator has only its ``fleet``."""
+        """Release state, inputs and kernel arrays; a closed simulator keeps only its ``fleet``."""
         if self._stages is not None:
             self._stages.workload.close()
         self._stages = self._state = self._drivers = None
@@ -319,7 +320,7 @@ class Simulator:
         self.close()
 
     def _started(self) -> Stages:
-        """The stages, made on first use: they size all devices and need the Taichi runtime."""
+        """Return the stages, created on first use, since they size devices and start Taichi."""
         self._check_open()
         if self._stages is None:
             self._stages = make_stages(
@@ -332,10 +333,10 @@ class Simulator:
             raise RuntimeStateError("the simulator is closed; create a new one")
 
     def _checked_drivers(self, drivers: Drivers) -> Drivers:
-        """Inputs, of as many data centers as there are, with prices.
+        """Check the number of data centers of inputs, and add prices.
 
         Raises:
-            ConfigError: Those of more or fewer.
+            ConfigError: The inputs are of more or fewer data centers than the fleet.
         """
         if drivers.size != self.fleet.size:
             raise ConfigError(
@@ -344,7 +345,7 @@ class Simulator:
         return with_prices(drivers, self.fleet.configs)
 
     def _seeds(self, seed: int | Sequence[int] | I64) -> I64:
-        """Seeds of the data centers, (B,)."""
+        """Check a seed argument and return a seed for each data center, (B,)."""
         listed: list[Any] = np.ravel(seed).tolist() if np.ndim(seed) else [seed]
         whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
         expected = self.size if np.ndim(seed) else 1
@@ -366,7 +367,10 @@ def _next_state(
     racks: RackOutcome,
     thermal: Mapping[str, Any],
 ) -> State:
-    """State at the end of a step; copies of what results hold, which callers may change."""
+    """Return the state at the end of a step.
+
+    Arrays that a ``StepResult`` contains are copied, because callers can modify results.
+    """
     return State(
         step=state.step + 1,
         seed=state.seed,

@@ -1,4 +1,4 @@
-"""Size every device of a fleet for its load and its site."""
+"""Sizing of all devices of a fleet for design load and design weather."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ from sdc_taichi.types import F64, fields_of
 WATER_DENSITY_KG_M3 = 1000.0
 """Density of water, in kg/m3."""
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
-"""Design dry bulbs of the released SustainDC, in C, by the first letters of the site; else 50 C."""
+"""Design dry bulbs of the released SustainDC, in C, by the first two letters of the site; 50 C for
+all other sites."""
 
 OFF_DESIGN_MARGIN = 1.05
-"""Largest margin of the chiller's capacity over the design load at other than the design water;
-power and airflow of a hall grow by a few percent with its setpoint."""
+"""Maximum factor of chiller capacity to design load at water temperatures off the design point; it
+covers the growth of IT power with the setpoint, a few percent."""
 _GRID = np.linspace(0.0, 1.0, 5)
-"""Where within their ranges the temperatures of the water are tried at which a chiller is sized."""
+"""Positions, within their ranges, of the water temperatures for which chiller capacity is
+checked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +52,16 @@ class Sizing:
     design_wet_bulb_c: F64
     """Design wet bulb of the site, in C, (B,)."""
     facility_w: F64
-    """IT and HVAC power at the design point, and ``counted_loss_w``, in W, (B,)."""
+    """IT power, HVAC power and ``counted_loss_w`` at the design point, in W, (B,)."""
     counted_loss_w: F64
-    """Losses of UPS and distribution at the design point, in W, (B,); 0 where they are only
-    reported."""
+    """Losses of UPS and distribution at the design point, in W, (B,); 0 if the losses are reported
+    without being counted in the facility power."""
     battery_kwh: F64
     """Capacity of the battery, in kWh, (B,)."""
     grid_limit_kw: F64
-    """Most power that the grid connection carries, in kW, (B,); ``NO_LIMIT_KW`` without a limit."""
+    """Power limit of the grid connection, in kW, (B,); ``NO_LIMIT_KW`` without a limit."""
     room_kwh_per_k: F64
-    """Heat that warms the room, and its servers if quasi-steady, by 1 K, in kWh/K, (B,)."""
+    """Heat capacity of the room, in kWh/K, (B,); in quasi-steady halls with the servers."""
     water_side: WaterSideDesign
     """Sized chiller, tower, pumps and economiser."""
     power_path: PowerPath
@@ -67,18 +69,18 @@ class Sizing:
 
 
 def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64) -> Sizing:
-    """Size every device of a fleet by the sizing model that its configs name.
+    """Size every device of a fleet by the configured sizing model.
 
     Args:
         fleet: B data centers.
-        hall: Their halls; sizes are as exact as its precision.
-        design_outdoor_c: Design dry bulb of each site's weather, C, (B,); that of a config goes
-            first.
-        design_wet_bulb_c: Design wet bulb of each site's weather, C, (B,); that of a config goes
-            first.
+        hall: Hall solver of the fleet; its precision limits the precision of the sizes.
+        design_outdoor_c: Design dry bulb of each site's weather, in C, (B,); a configured value
+            takes precedence.
+        design_wet_bulb_c: Design wet bulb of each site's weather, in C, (B,); a configured value
+            takes precedence.
 
     Raises:
-        PhysicalLimitError: A device whose size is negative, infinite or not a number.
+        PhysicalLimitError: The size of a device is negative, infinite or NaN.
     """
     outdoor_c = fleet.values("hvac.sizing.design_outdoor_c")
     wet_bulb_c = fleet.values("hvac.sizing.design_wet_bulb_c")
@@ -94,7 +96,7 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 
 
 def _check_sizes(fleet: Fleet, sized: Sizing) -> None:
-    """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
+    """Check that capacities, flows and powers of sized devices are finite and not negative."""
     sizes = fields_of(sized) | fields_of(sized.water_side)
     for name, values in sizes.items():
         if name in ("water_side", "power_path", "machine") or name.endswith("_c"):
@@ -110,20 +112,22 @@ def _check_sizes(fleet: Fleet, sized: Sizing) -> None:
 
 
 def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
-    """Full load, design supply air and design wet bulb, with the margin of the config on top.
+    """Size devices for full load, design supply air and design weather, plus a margin.
+
+    The margin is ``hvac.sizing.margin``.
 
     Args:
         fleet: B data centers.
-        hall: Their halls.
-        outdoor_c: Design dry bulb, C, (B,).
-        wet_bulb_c: Design wet bulb, C, (B,).
+        hall: Hall solver of the fleet.
+        outdoor_c: Design dry bulb, in C, (B,).
+        wet_bulb_c: Design wet bulb, in C, (B,).
     """
     v = fleet.values
     full = _solve(fleet, hall, v("hall.design_supply_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.it_fan_w
     crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
-    # Spare units let all run at part speed.
+    # With spare units, all units run at part speed.
     crac_at_design_w = crac_fan_w * fleet.design_speed**3
     cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
     pump_heat_w = v("hvac.pumps.heat_to_water_share") * _chilled_pump_w(fleet, cooling_w)
@@ -163,24 +167,25 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
 
 
 def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
-    """The sizing rules of the released SustainDC.
+    """Size devices by the rules of the released SustainDC.
 
-    Tower air and rated load: the cooling load at full load and highest setpoint, taken down to the
-    lowest setpoint, with 50 - (design outdoor - lowest setpoint) K of air. Battery: one hour of
-    1.1 times the highest IT power of 15..22 C plus 1.1 times rated load and chiller power.
+    The rated load is the heat that cools the return air at full load and maximum setpoint down to
+    the minimum setpoint. The tower's airflow removes this load with a temperature difference of
+    50 - (design outdoor - minimum setpoint) K. The battery stores one hour of 1.1 times the sum of
+    maximum IT power at supply temperatures of 15..22 C, rated load and chiller power.
 
     Args:
         fleet: B data centers.
-        hall: Their halls.
-        outdoor_c: Design dry bulb, C, (B,); not used, sites have those of ``RELEASED_OUTDOOR_C``.
-        wet_bulb_c: Design wet bulb, C, (B,).
+        hall: Hall solver of the fleet.
+        outdoor_c: Design dry bulb, in C, (B,); ignored in favour of ``RELEASED_OUTDOOR_C``.
+        wet_bulb_c: Design wet bulb, in C, (B,).
     """
     v = fleet.values
     listed_c = np.array(
         [RELEASED_OUTDOOR_C.get(c.site.location.upper()[:2], 50.0) for c in fleet.configs]
     )
-    given_c = v("hvac.sizing.design_outdoor_c")
-    outdoor_c = np.where(np.isnan(given_c), listed_c, given_c)
+    configured_c = v("hvac.sizing.design_outdoor_c")
+    outdoor_c = np.where(np.isnan(configured_c), listed_c, configured_c)
     low_c, supply_m3s_per_w = v("hvac.setpoint.min_c"), v("hvac.crac.supply_m3s_per_w")
     full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.it_fan_w
@@ -224,14 +229,15 @@ MODELS: dict[str, Callable[[Fleet, Hall, F64, F64], Sizing]] = {
     "design_day": design_day,
     "released": released,
 }
-"""Sizing models by the names that ``hvac.sizing.model`` takes."""
+"""Sizing models by their names in ``hvac.sizing.model``."""
 
 
 def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
-    """Lowest and highest values of a fleet over 15..22 C of supply air and 0..100 % of load.
+    """Return ranges of IT power and outlet temperature for supply air of 15..22 C and any load.
 
     Returns:
-        ``it_w``: IT power, W; ``outlet_c``: mean outlet, C; each as lowest and highest, (B,).
+        Minimum and maximum, (B,) each, of ``it_w``, the IT power in W, and of ``outlet_c``, the
+        mean outlet temperature in C.
     """
     it_w, outlet_c = [], []
     for supply_c in range(15, 23):
@@ -251,31 +257,31 @@ def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
 
 
 def _solve(fleet: Fleet, hall: Hall, supply_c: F64, utilisation: F64) -> HallSums:
-    """The hall in order, at one supply temperature and the CRAC airflow of the design point."""
+    """Solve the halls without failures, at a supply temperature and the design CRAC airflow."""
     speed = fleet.design_speed[fleet.unit_dc]
     supply_c = supply_c[fleet.unit_dc]
     return hall.solve(Conditions(supply_c, utilisation, unit_low=speed, unit_high=speed))
 
 
 def air_j_per_m3_k(fleet: Fleet) -> F64:
-    """Heat capacity of air per volume, J/(m3 K), (B,)."""
+    """Return the volumetric heat capacity of air, in J/(m3 K), (B,)."""
     return np.asarray(fleet.dcs[row_index(DC_COEFFICIENTS, "air_j_per_m3_k")])
 
 
 def sites_pressure_pa(fleet: Fleet) -> F64:
-    """Air pressure of the standard atmosphere at the height of each site, Pa, (B,)."""
+    """Return the standard-atmosphere pressure at the elevation of each site, in Pa, (B,)."""
     places = [(c.site.location, c.site.weather_file) for c in fleet.configs]
     pressure_pa = {place: site_pressure_pa(*place) for place in dict.fromkeys(places)}
     return np.array([pressure_pa[place] for place in places])
 
 
 def mean_return_approach_k(fleet: Fleet) -> F64:
-    """Return approach temperature, mean over the racks, K, (B,)."""
+    """Compute the mean over the racks of the return approach temperature, in K, (B,)."""
     return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
 
 
 def _machine(fleet: Fleet) -> ChillerParameters:
-    """Parameters of the chillers; the COP is that of the model where the config gives none."""
+    """Return the chiller parameters; the default of the COP is that of the chiller model."""
     configured = {name: fleet.values(f"hvac.chiller.{name}") for name in ChillerParameters._fields}
     usual = CHILLERS[fleet.models["chiller"]].reference_cop
     cop = configured.pop("reference_cop")
@@ -285,18 +291,19 @@ def _machine(fleet: Fleet) -> ChillerParameters:
 def _design_chiller(
     fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
 ) -> tuple[F64, ChillerResult, F64]:
-    """Size of the chiller.
+    """Size the chiller.
 
-    It cools ``cooling_w`` at the design wet bulb, and the load within, with a margin of up to 5 %,
-    with any other water that the plant meets: chilled water of every setpoint, condenser water from
-    the coldest that the chiller takes. Capacity may fall in cold condenser water.
+    At the design wet bulb, the chiller cools ``cooling_w``, which includes the sizing margin. At
+    all other water temperatures of the plant, it cools the load without this margin plus up to
+    5 %. These are chilled water for every setpoint, and condenser water from the minimum of the
+    chiller up to the design temperature, because capacity can fall in cold condenser water.
 
     Returns:
-        Reference capacity, W, the chiller as it cools at design, and the condenser water at which
-        it has most capacity, C, each (B,).
+        Reference capacity in W; result of the chiller at the design point; and the condenser water
+        temperature of maximum capacity in C; (B,) each.
 
     Raises:
-        PhysicalLimitError: The chiller has no capacity in such weather.
+        PhysicalLimitError: The chiller has no capacity at some of these temperatures.
     """
     v, name = fleet.values, fleet.models["chiller"]
     model, machine = CHILLERS[name], _machine(fleet)
@@ -330,7 +337,7 @@ def _design_chiller(
     margin = v("hvac.sizing.margin")
     share = np.minimum(margin, OFF_DESIGN_MARGIN) / margin
     chiller_w = cooling_w * np.maximum(1.0 / design_w_per_w, share / least_w_per_w)
-    # The coldest chilled water asks most of the chiller.
+    # Chiller power is highest at the coldest chilled water.
     at_design = at(low_c, design_c, cooling_w, chiller_w)
     return chiller_w, at_design, np.choose(w_per_w.argmax(axis=0), condenser_c)
 
@@ -344,7 +351,7 @@ def _water_side(
     outdoor_c: F64,
     wet_bulb_c: F64,
 ) -> WaterSideDesign:
-    """Chiller, tower, pumps and economiser for the given heat and CRAC airflow, each (B,)."""
+    """Size tower, pumps and economiser for the given heat flows and CRAC airflow, (B,) each."""
     v = fleet.values
     approach_k = v("hvac.tower.approach_min_k")
     if PLANTS[fleet.models["plant"]].dry:
@@ -374,7 +381,7 @@ def _water_side(
 
 
 def _outdoor_air_limits(fleet: Fleet) -> dict[str, F64]:
-    """Vapour pressures, Pa, and relative humidity within which outdoor air is let in, (B,)."""
+    """Return the limits of vapour pressure (Pa) and relative humidity for outdoor air, (B,)."""
     v = fleet.values
     least_pa, most_pa = (
         np.asarray(moist_air.saturation_pa(v(f"hvac.outdoor_air.{end}_dew_point_c")))
@@ -390,7 +397,7 @@ def _outdoor_air_limits(fleet: Fleet) -> dict[str, F64]:
 
 
 def _dry_units(fleet: Fleet, cooling_w: F64, crac_flow_m3s: F64) -> dict[str, F64]:
-    """Fans of a dry cooler or of outdoor air, in the fields of a tower, which has no water."""
+    """Size the fans of a dry cooler or of outdoor air, as fields of a tower without water."""
     v = fleet.values
     sized = {
         "economiser": v("hvac.dry_cooler.free_cooling"),
@@ -409,7 +416,7 @@ def _dry_units(fleet: Fleet, cooling_w: F64, crac_flow_m3s: F64) -> dict[str, F6
 def _tower(
     fleet: Fleet, cooling_w: F64, rejected_w: F64, outdoor_c: F64, wet_bulb_c: F64
 ) -> dict[str, F64]:
-    """Water, air and fan of the tower, by the rule of its model."""
+    """Size water flow, airflow and fan of the tower by the rule of its model."""
     v, air = fleet.values, air_j_per_m3_k(fleet)
     range_k = v("hvac.tower.water_range_k")
     water_kg_s = np.asarray(design_water_kg_s(rejected_w, range_k=range_k))
@@ -436,7 +443,10 @@ def _tower(
 
 
 def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
-    """Pumps of chilled water and of the loop outdoors: sized for their flow, or unscaled."""
+    """Return power and limits of the chilled-water pumps and of the condenser or dry-cooler pumps.
+
+    Pump model ``released`` uses configured powers; other models size the pumps for their flow.
+    """
     v = fleet.values
     chilled = {
         "chilled_pump_w": _chilled_pump_w(fleet, cooling_w),
@@ -461,14 +471,14 @@ def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
 
 
 def _chilled_pump_w(fleet: Fleet, cooling_w: F64) -> F64:
-    """Power of the chilled-water pumps at design, W, (B,)."""
+    """Return the design power of the chilled-water pumps, in W, (B,)."""
     if fleet.models["pumps"] == "released":
         return fleet.values("hvac.pumps.released_chilled_w")
     return _sized_pump_w(fleet, cooling_w, fleet.values("hvac.chiller.chilled_water_range_k"))
 
 
 def _sized_pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
-    """Power of pumps whose water carries a heat, W, with a range, K, each (B,)."""
+    """Return the power of pumps in W, (B,), for a heat flow (W) and a water range (K)."""
     v = fleet.values
     flow = np.asarray(design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
     return hydraulic_pump_w(
@@ -477,13 +487,17 @@ def _sized_pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
 
 
 def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
-    """Capacity of the battery, kWh, (B,): that of the config, or as sized."""
+    """Return the battery capacity in kWh, (B,): the configured value, or ``sized_kwh``."""
     configured_kwh = fleet.values("battery.capacity_kwh")
     return np.where(np.isnan(configured_kwh), sized_kwh, configured_kwh)
 
 
 def _power_path(fleet: Fleet, it_w: F64) -> tuple[PowerPath, F64]:
-    """UPS and distribution for an IT power, W, (B,), and the losses there that count, W, (B,)."""
+    """Size UPS and distribution for an IT power in W, (B,).
+
+    Returns:
+        The sized devices, and the losses that count in the facility power, in W, (B,).
+    """
 
     def device(name: str, carried_w: F64) -> LossyDevice:
         rated_w = fleet.values("electrical.capacity_ratio") * carried_w
@@ -497,18 +511,19 @@ def _power_path(fleet: Fleet, it_w: F64) -> tuple[PowerPath, F64]:
 
 
 def _grid_limit_kw(fleet: Fleet, design_kw: F64) -> F64:
-    """Most power of the grid connection, kW, (B,): as given, or in proportion to the design."""
-    given_kw = fleet.values("electrical.grid_limit_kw")
+    """Return the grid connection limit in kW, (B,): configured, or a ratio to the design power."""
+    configured_kw = fleet.values("electrical.grid_limit_kw")
     ratio = fleet.values("electrical.grid_limit_ratio")
     sized_kw = np.where(np.isnan(ratio), NO_LIMIT_KW, ratio * design_kw)
-    return np.minimum(np.where(np.isnan(given_kw), sized_kw, given_kw), NO_LIMIT_KW)
+    limit_kw = np.where(np.isnan(configured_kw), sized_kw, configured_kw)
+    return np.minimum(limit_kw, NO_LIMIT_KW)
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:
-    """Heat capacity that follows the supply air, kWh/K, (B,).
+    """Return the heat capacity of the room, in kWh/K, (B,).
 
-    Quasi-steady halls: with the servers. Transient ones: servers and the air before the racks,
-    which is that of the room, have temperatures of their own.
+    In quasi-steady halls it includes the servers. In transient halls, servers and the air before
+    the racks have separate temperatures.
     """
     per_server = fleet.values("room_heat_capacity_kj_per_k")
     if fleet.models["thermal"] == "quasi_steady":

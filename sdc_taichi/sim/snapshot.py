@@ -1,4 +1,4 @@
-"""States as plain arrays and in files: written, read and checked before a run goes on from them."""
+"""Snapshots of a simulator: write, read and check states as plain arrays and as files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sdc_taichi.types import State, fields_of
 from sdc_taichi.user_file import ArrayFile, open_input
 
 MOST_STEPS = 10**9
-"""Most steps since reset: 1,900 years of minutes."""
+"""Maximum number of steps since reset: 1,900 years of one-minute steps."""
 LAST_START = 2**53
-"""Latest first step: beyond, steps would not be exact as f64."""
+"""Largest index of a first step; larger indices are not exact in f64."""
 LIMITS: dict[str, tuple[float, float]] = {
     "step": (0, MOST_STEPS),
     "seed": (0, np.inf),
@@ -34,31 +34,31 @@ LIMITS: dict[str, tuple[float, float]] = {
     "fan_speed": (0.0, 1.0),
     "rack_status": (NORMAL, TRIPPED),
 }
-"""Lowest and highest value of fields of ``State``; all others lie within ``OTHER_LIMITS``.
+"""Minimum and maximum of fields of ``State``; ``OTHER_LIMITS`` applies to all other fields.
 
-A whole file of this simulator holds no other values: these limits catch damaged ones. What lies
-within them and cannot be continued ends in the next step, as a ``PhysicalLimitError``."""
+The limits detect damaged files. A state within the limits from which no physical step is possible
+raises a ``PhysicalLimitError`` in the next step."""
 OTHER_LIMITS = (-1e12, 1e12)
-"""Lowest and highest value of the other fields of ``State``."""
+"""Minimum and maximum of the fields of ``State`` that ``LIMITS`` does not list."""
 VERSION = 3
-"""Version of what a snapshot holds."""
+"""Version of the snapshot format."""
 
 
 def fingerprint(fleet: Fleet, drivers: Drivers, precision: str) -> str:
-    """SHA-256 of configs, inputs and precision, which tells simulators apart.
+    """Return the SHA-256 of configs, inputs and precision, which identifies a simulator.
 
-    Equal on all processors, so that a state can be continued on another one, unless a value of the
-    inputs rounds apart there.
+    Numbers are rounded to f32 first, so that the fingerprint normally does not depend on the
+    processor and a run can continue on another machine.
     """
     digest = hashlib.sha256(precision.encode())
-    # Environments of a batch share their configs.
+    # Many data centers can share one config object, which is then converted to JSON only once.
     texts: dict[int, bytes] = {}
     for config in fleet.configs:
         if id(config) not in texts:
             texts[id(config)] = config.model_dump_json().encode()
         digest.update(texts[id(config)])
     digest.update(drivers.digest())
-    # A matrix that a config names may change under its name.
+    # The content of a matrix file can change without a change of its name in the config.
     if (air := fleet.air) is not None:
         mix = air.mix_weights
         for part in (mix.weights, mix.norm, mix.strength, air.exhaust_share, fleet.dcs):
@@ -67,11 +67,11 @@ def fingerprint(fleet: Fleet, drivers: Drivers, precision: str) -> str:
 
 
 def to_dict(state: State, fingerprint: str) -> dict[str, Any]:
-    """A state as copies of its arrays, with what tells which simulator it is of.
+    """Return a snapshot: copies of the arrays of a state, its version and its fingerprint.
 
     Args:
         state: State to copy.
-        fingerprint: Of the simulator, see ``fingerprint``.
+        fingerprint: Fingerprint of the simulator, see ``fingerprint``.
     """
     out = {name: np.array(values) for name, values in fields_of(state).items()}
     out["version"] = np.array(VERSION)
@@ -80,14 +80,14 @@ def to_dict(state: State, fingerprint: str) -> dict[str, Any]:
 
 
 def check_origin(values: Any, fingerprint: str) -> None:
-    """Make sure that values are a whole snapshot of one simulator.
+    """Check that a snapshot is complete and belongs to one simulator.
 
     Args:
-        values: Arrays by name.
-        fingerprint: Of the simulator, see ``fingerprint``.
+        values: Snapshot as arrays by name.
+        fingerprint: Fingerprint of the simulator, see ``fingerprint``.
 
     Raises:
-        SdcError: Values that are incomplete, or of another version or simulator.
+        SdcError: The snapshot is incomplete, or of another version or simulator.
     """
     if not isinstance(values, Mapping):
         raise SdcError(
@@ -111,14 +111,14 @@ def check_origin(values: Any, fingerprint: str) -> None:
 
 
 def to_state(values: Mapping[str, Any], like: State) -> State:
-    """The state that a snapshot holds.
+    """Return the state of a snapshot.
 
     Args:
-        values: Arrays by name, see ``check_origin``.
-        like: State of the simulator that goes on from it, for shapes and types.
+        values: Snapshot that ``check_origin`` has accepted.
+        like: State of the simulator, which defines shapes and types.
 
     Raises:
-        SdcError: Values of wrong shape, type or range.
+        SdcError: A value has a wrong shape, type or range.
     """
     fields_checked = {
         name: _checked(name, values[name], model) for name, model in fields_of(like).items()
@@ -137,27 +137,27 @@ def write(path: str | os.PathLike[str], values: Mapping[str, Any]) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Arrays by name from a file of ``write``.
+    """Read arrays by name from a file of ``write``.
 
     Raises:
         SdcError: The file cannot be read.
     """
     with open_input(path) as file:
         arrays = ArrayFile(file, path)
-        # Files of ``write`` are not compressed.
+        # Files of ``write`` are not compressed, so no array can be larger than the file.
         most_bytes = os.fstat(file.fileno()).st_size
         return {name: arrays.read(name, most_bytes) for name in arrays.names}
 
 
 def as_array(label: str, value: Any) -> npt.NDArray[Any]:
-    """An array or number of NumPy as an array.
+    """Convert a NumPy array or scalar to an array.
 
     Args:
-        label: What it is, for errors.
+        label: Name of the value, for the error message.
         value: Any value.
 
     Raises:
-        SdcError: A value of another kind.
+        SdcError: The value is neither a NumPy array nor a NumPy scalar.
     """
     if not isinstance(value, np.ndarray | np.generic):
         raise SdcError(f"{label} is a {type(value).__name__}; valid is an array of NumPy")
@@ -165,7 +165,7 @@ def as_array(label: str, value: Any) -> npt.NDArray[Any]:
 
 
 def _checked(name: str, value: Any, like: Any) -> Any:
-    """A copy of a field of a state, of the shape, type and range that it must have."""
+    """Return a copy of a field of a state after checking its shape, type and range."""
     model, array = np.asarray(like), as_array(f"snapshot: {name}", value)
     if array.shape != model.shape or array.dtype != model.dtype:
         raise SdcError(
@@ -174,7 +174,7 @@ def _checked(name: str, value: Any, like: Any) -> Any:
     low, high = LIMITS.get(name, OTHER_LIMITS)
     is_valid = (array >= low) & (array <= high)
     if name == "cooling_last":
-        # There is no last command before the first step.
+        # nan means that there was no command yet.
         is_valid |= np.isnan(array)
     if not np.all(is_valid):
         at = np.unravel_index(np.argmin(is_valid), array.shape)

@@ -1,4 +1,4 @@
-"""The stages of a step, made for a fleet, and facilities at constant load and setpoint."""
+"""Stages of a step for a fleet, and quasi-steady facilities at constant load and setpoint."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from sdc_taichi.types import F64, I64, State
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """Stages of a step, and the objects that they share."""
+    """Models of the stages of a step, and the objects that they share."""
 
     hall: Hall
-    """Temperatures and power of servers and air."""
+    """Solver for temperatures and power of servers and air."""
     sizing: Sizing
     """Sized devices."""
     decoder: ActionDecoder
-    """From actions to commands."""
+    """Converter from actions to commands."""
     surroundings: SurroundingsModel
-    """Weather, demand, and what is out of order."""
+    """Model of weather, demand and failures."""
     workload: Workload
-    """Work that runs, waits, is due or dropped."""
+    """Workload model and queues."""
     allocation: WorkAllocation
-    """Which racks work, and what they protect themselves from."""
+    """Placement of work on racks, and thermal protection of the racks."""
     crac_units: CracUnits
-    """Setpoints and fan speeds."""
+    """Model of setpoints and fan speeds."""
     air: SteadyAir | TransientAir
-    """Air of the halls, quasi-steady or transient."""
+    """Air model of the halls, quasi-steady or transient."""
     facility: FacilityStage
-    """Plant, water, battery, grid and carbon."""
+    """Models of plant, water, battery, grid and carbon."""
 
     def initial_state(self, fleet: Fleet, seeds: I64, drivers: Drivers) -> State:
-        """The state before the first step.
+        """Return the state before the first step.
 
         Args:
-            fleet: The B data centers that the stages are of.
+            fleet: The B data centers for which the stages were made.
             seeds: Seed of the sampled events of each data center, (B,).
-            drivers: Inputs, with the first step.
+            drivers: Inputs, which define the first step of the run.
         """
         supply = self.crac_units.initial_supply()
         return State(
@@ -78,16 +78,16 @@ class Stages:
 def make_stages(
     fleet: Fleet, drivers: Drivers, precision: Precision, *, event_free: bool
 ) -> Stages:
-    """Make the stages of a fleet, and size all its devices.
+    """Create the stages of a fleet, and size all its devices.
 
     Args:
         fleet: B data centers.
-        drivers: Inputs, with the design temperatures of the sites.
-        precision: Of the server kernels.
-        event_free: Whether no event can ever happen.
+        drivers: Inputs, which contain the design temperatures of the sites.
+        precision: Precision of the server kernels.
+        event_free: True if no event can ever occur.
 
     Raises:
-        PhysicalLimitError: A device whose size is negative, infinite or not a number.
+        PhysicalLimitError: The size of a device is negative, infinite or NaN.
     """
     hall, units = Hall(fleet, precision), UnitIndex(fleet)
     sizing = size(fleet, hall, drivers.design_outdoor_c, drivers.design_wet_bulb_c)
@@ -116,33 +116,33 @@ def make_stages(
 
 @dataclass(frozen=True, slots=True)
 class SteadyStep:
-    """One step of B data centers whose room holds no heat from earlier ones."""
+    """Results of one step of B data centers without heat stored by earlier steps."""
 
     facility_kwh: F64
-    """IT and overhead energy, without the battery, in kWh, (B,)."""
+    """Energy of IT and overhead, without the battery, in kWh, (B,)."""
     water_l: F64
     """Make-up water, in l, (B,)."""
     unmet_w: F64
-    """Cooling load that stays in the room, in W, (B,); inf where results are beyond what is
-    physical."""
+    """Cooling load that is not removed, in W, (B,); inf if a result is beyond its physical
+    limits."""
 
 
 class SteadyFacility:
-    """Copies of data centers, each at a constant utilisation and setpoint.
+    """Copies of data centers, each at a constant utilisation and setpoint, in any weather.
 
-    Copies are quasi-steady, meet no events, do not protect themselves and have nothing in the
-    queue; devices have the sizes that those of the originals have.
+    The copies are quasi-steady, without events, rack protection and queued work. Their devices have
+    the same sizes as those of the originals.
 
     Args:
-        configs: Data centers to copy.
-        drivers: Their inputs, of which the design temperatures are read.
-        of: Which data center each copy is of, (B,).
+        configs: Configs of the data centers to copy.
+        drivers: Inputs of these data centers; only the design temperatures are read.
+        of: Index into ``configs`` for each copy, (B,).
         utilisation: Utilisation of each copy, 0..1, (B,).
         setpoint_c: Setpoint of each copy, within the range of its config, in C, (B,).
-        precision: Of the server kernels.
+        precision: Precision of the server kernels.
 
     Raises:
-        PhysicalLimitError: A hall without steady air.
+        PhysicalLimitError: The air of a hall has no steady state.
     """
 
     def __init__(
@@ -155,11 +155,11 @@ class SteadyFacility:
         precision: Precision,
     ) -> None:
         with warnings.catch_warnings():
-            # The originals have given these warnings.
+            # The same warnings have been issued for the originals.
             warnings.simplefilter("ignore", OddInputWarning)
             fleet = build_fleet(_copies(configs, of, setpoint_c))
         self._step_h = 1.0 / fleet.steps_per_hour
-        # Weather is given step by step, and neither intensity nor price reaches the facility.
+        # ``at`` sets the weather; carbon intensity and price do not affect its results.
         still = FleetSeries(np.zeros(1), np.zeros_like(of), np.ones_like(of))
         inputs = replace(
             drivers,
@@ -191,18 +191,18 @@ class SteadyFacility:
         self._supply = stages.crac_units.initial_supply()
         self._air = self._solve_air()
         self.inlet_max_c: F64 = self._air.inlet_max_c
-        """Hottest inlet of a server of each copy, in C, (B,)."""
+        """Highest server inlet temperature of each copy, in C, (B,)."""
         self.outlet_max_c: F64 = np.maximum.reduceat(
             self._air.rack_outlet_max_c.astype(np.float64), fleet.rack_offsets[:-1]
         )
-        """Hottest outlet of a server of each copy, in C, (B,)."""
+        """Highest server outlet temperature of each copy, in C, (B,)."""
 
     def at(self, outdoor_c: F64, wet_bulb_c: F64) -> SteadyStep:
-        """One step in some weather.
+        """Run one step in the given weather.
 
         Args:
-            outdoor_c: Dry-bulb temperature outside, in C, (B,).
-            wet_bulb_c: Wet-bulb temperature outside, in C, (B,).
+            outdoor_c: Outdoor dry bulb, in C, (B,).
+            wet_bulb_c: Outdoor wet bulb, in C, (B,).
         """
         self._surroundings.outdoor_c, self._surroundings.wet_bulb_c = outdoor_c, wet_bulb_c
         results = self._stages.facility.step(
@@ -216,11 +216,11 @@ class SteadyFacility:
         )
 
     def close(self) -> None:
-        """Let go of the kernel arrays."""
+        """Release the kernel arrays."""
         self._stages.workload.close()
 
     def _solve_air(self) -> HallSums:
-        """Air, temperatures and power of the halls under their load."""
+        """Solve airflows, temperatures and power of the halls at their constant load."""
         stages, surroundings = self._stages, self._surroundings
         capacity = stages.allocation.capacity(self._state, self._commands, surroundings)
         work = stages.workload.run(
@@ -239,7 +239,7 @@ class SteadyFacility:
 def _copies(
     configs: Sequence[DataCenterConfig], of: I64, setpoint_c: F64
 ) -> list[DataCenterConfig]:
-    """Copies of data centers with first setpoints, which share equal sections."""
+    """Create copies of configs with given initial setpoints; equal copies share one object."""
     plain: dict[int, DataCenterConfig] = {}
     at: dict[tuple[int, float], DataCenterConfig] = {}
     for which, value_c in dict.fromkeys(zip(of.tolist(), setpoint_c.tolist(), strict=True)):
@@ -253,7 +253,10 @@ def _copies(
 
 
 def _without_memory(config: DataCenterConfig) -> DataCenterConfig:
-    """A data center of which a step leaves nothing to the next, but for what a plan moves."""
+    """Return a config without events, protection and thermal storage, whose steps are independent.
+
+    Only queue and battery still connect the steps.
+    """
     work, simulation = config.workload, config.simulation
     return config.model_copy(
         update={

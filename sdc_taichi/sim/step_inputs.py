@@ -1,4 +1,4 @@
-"""What a step starts from: commands of its actions, and surroundings of the data centers."""
+"""Inputs of a step: commands decoded from actions, and surroundings of the data centers."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from sdc_taichi.types import (
 
 
 class UnitIndex:
-    """The U CRAC units of B data centers.
+    """Mapping between values of B data centers, (B,), and of their U CRAC units, (U,).
 
-    Where every data center has one unit, (U,) and (B,) are the same, and nothing is computed.
+    If every data center has one unit, values are passed through without computation.
 
     Args:
-        fleet: B data centers with one CRAC unit or more each.
+        fleet: B data centers with one or more CRAC units each.
     """
 
     def __init__(self, fleet: Fleet) -> None:
@@ -40,31 +40,31 @@ class UnitIndex:
         self._counts = np.diff(fleet.unit_offsets)
         self._first = fleet.unit_offsets[:-1]
         self.dc = fleet.unit_dc
-        """Data center of each unit, (U,)."""
+        """Index of each unit's data center, (U,)."""
         self.one_each = fleet.units == fleet.size
-        """Whether every data center has one unit."""
+        """True if every data center has exactly one unit."""
 
     def of_each(self, per_dc: F64) -> F64:
-        """For each unit the value of its data center, (U,)."""
+        """Return the value of each unit's data center, (U,)."""
         return per_dc if self.one_each else per_dc[self.dc]
 
     def mean(self, per_unit: F64) -> F64:
-        """Mean over the units of each data center, a new array, (B,)."""
+        """Return the mean over the units of each data center as a new array, (B,)."""
         return per_unit.copy() if self.one_each else self.sum(per_unit) / self._counts
 
     def sum(self, per_unit: F64) -> F64:
-        """Sum over the units of each data center, (B,)."""
+        """Return the sum over the units of each data center, (B,)."""
         return per_unit if self.one_each else self._fleet.unit_sums(per_unit)
 
     def lowest(self, per_unit: F64) -> F64:
-        """Lowest value among the units of each data center, (B,)."""
+        """Return the minimum over the units of each data center, (B,)."""
         if self.one_each:
             return per_unit
         return np.asarray(np.minimum.reduceat(per_unit, self._first), dtype=np.float64)
 
 
 MOST_MOVES = 1e6
-"""Largest command of a setpoint or a fan, in steps; far beyond the range of either."""
+"""Maximum absolute setpoint or fan command, in steps; far beyond the range of both."""
 
 
 @dataclass
@@ -72,21 +72,21 @@ class Commands(CommandQuantities):
     """Actions of one step as arrays: B data centers, U CRAC units, G server groups."""
 
     unit_cooling_command: F64
-    """Steps by which the setpoint of each CRAC unit moves, (U,)."""
+    """Commanded change of each CRAC unit's setpoint, in setpoint steps, (U,)."""
     follows_schedule: bool
-    """Whether setpoints that have a schedule follow it, as no cooling command is given."""
+    """True if no cooling command is given, so that setpoints with a schedule follow it."""
     unit_fan_command: F64 | None
-    """Steps by which the speed of each CRAC fan moves, (U,); None holds all of them."""
+    """Commanded change of each CRAC fan's speed, in fan steps, (U,); None holds all speeds."""
     group_weights: F64 | None
-    """Relative load of each server group, (G,); None weighs all alike."""
+    """Relative load of each server group, (G,); None weighs all groups equally."""
 
 
 class ActionDecoder:
-    """Checks actions and brings every form that they may have to arrays.
+    """Checks actions in any of their forms and converts them to arrays.
 
     Args:
         fleet: B data centers with U CRAC units and G server groups.
-        units: The CRAC units by data center.
+        units: Mapping between data centers and CRAC units.
     """
 
     def __init__(self, fleet: Fleet, units: UnitIndex) -> None:
@@ -96,13 +96,14 @@ class ActionDecoder:
         self._placement = fleet.models["placement"]
 
     def decode(self, actions: Actions | None) -> Commands:
-        """Commands of one step.
+        """Convert the actions of one step to commands.
 
         Args:
-            actions: What to do; None is neutral.
+            actions: Actions of the step; None means neutral actions.
 
         Raises:
-            SdcError: Actions of the wrong type, shape or range, or that no model reads.
+            SdcError: An action has a wrong type, shape or range, or the configured model does not
+                accept it.
         """
         if actions is not None and not isinstance(actions, Actions):
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
@@ -135,7 +136,7 @@ class ActionDecoder:
         return None
 
     def _group_weights(self, placement: Any) -> F64 | None:
-        """Weights of the server groups, (G,), from one per rack or per group."""
+        """Return weights of the server groups, (G,), from weights per rack or per group."""
         if placement is None:
             return None
         if self._placement != "weights":
@@ -158,7 +159,7 @@ class ActionDecoder:
         )
 
     def _unit_command(self, name: str, action: Any, kind: type[Enum]) -> F64:
-        """A command for each CRAC unit, (U,), given for all, per data center or per unit."""
+        """Return a command for each CRAC unit, (U,), from one for all, per data center or unit."""
         command = self._command(name, action, kind, limit=MOST_MOVES, also=self._n_units)
         return command if len(command) == self._n_units else self._units.of_each(command)
 
@@ -171,7 +172,10 @@ class ActionDecoder:
         limit: float,
         also: int | None = None,
     ) -> F64:
-        """A finite command within -limit..limit for each data center, (B,), or ``also`` entries."""
+        """Return a command for each data center, (B,), or per unit if it has ``also`` entries.
+
+        Every entry is checked to be finite and within -limit..limit.
+        """
         if isinstance(action, Enum):
             if not isinstance(action, kind):
                 raise SdcError(f"action {name}: {action} is no {kind.__name__}")
@@ -190,7 +194,7 @@ class ActionDecoder:
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
         largest = np.maximum.reduce(np.abs(command), axis=None)
-        # Comparisons with NaN are false, so that it ends here too.
+        # A comparison with NaN is false, so NaN raises the error as well.
         if not largest <= limit:
             wrong = ~(np.abs(command) <= limit)
             value = command[wrong].flat[0] if command.ndim else command
@@ -205,29 +209,30 @@ class Surroundings(SiteQuantities):
     """Surroundings of one step of B data centers, U CRAC units and R racks."""
 
     fully_powered: bool
-    """Whether all data centers have power throughout the step."""
+    """True if all data centers have power throughout the step."""
     chiller_share: F64
     """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
     pump_share: F64
-    """Chilled-water pumps that are in order, as a share of all, 0..1, (B,)."""
+    """Share of the chilled-water pumps that work, 0..1, (B,)."""
     outdoor_units: F64
-    """Tower cells, dry coolers or openings for outdoor air in order, as a share of all, 0..1,
-    (B,)."""
+    """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
     no_unit_down: F64
-    """1 if all CRAC units run, 0 if one is down, (B,)."""
+    """1 if all CRAC units of the data center run, else 0, (B,)."""
     all_running: bool
-    """Whether all CRAC units of all data centers run."""
+    """True if all CRAC units of all data centers run."""
     rack_airflow: F64 | None
-    """Airflow of each rack that remains, as a share of its full airflow, 0..1, (R,); None is 1."""
+    """Remaining airflow of each rack's fans as a share of full airflow, 0..1, (R,); None means
+    full airflow."""
 
 
 class SurroundingsModel:
-    """Puts together what a step meets.
+    """Combines exogenous inputs and events to the surroundings of a step.
 
     Args:
         fleet: B data centers.
-        units: Their CRAC units.
-        powered_share: ``Facility.powered_share``: how long batteries carry them in an outage.
+        units: Mapping between data centers and CRAC units.
+        powered_share: Function ``Facility.powered_share``, which returns the share of an outage
+            step that batteries cover.
     """
 
     def __init__(
@@ -241,12 +246,12 @@ class SurroundingsModel:
         self._unit_ones = np.ones(fleet.units)
 
     def at(self, exogenous: Exogenous, event: Disturbance, stored_kwh: F64) -> Surroundings:
-        """Surroundings of one step.
+        """Return the surroundings of one step.
 
         Args:
-            exogenous: Weather, carbon intensity and demand of the step.
-            event: What events do to the step.
-            stored_kwh: Energy in the batteries at the start of the step, kWh, (B,).
+            exogenous: Weather, carbon intensity, price and demand of the step.
+            event: Effects of events on the step.
+            stored_kwh: Energy in the batteries at the start of the step, in kWh, (B,).
         """
         if not event.active:
             return Surroundings(

@@ -1,4 +1,4 @@
-"""Which racks may work, where the work of a data center goes, and what its racks make of it."""
+"""Allocation of work to racks: capacity, placement, and the thermal protection of the racks."""
 
 from __future__ import annotations
 
@@ -20,50 +20,50 @@ from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import F64, I64, RackQuantities, State, Status
 
 UNMET_SHARE = 0.01
-"""Cooling keeps up where no more than this share of the cooling load stays in the room."""
+"""Maximum share of unmet cooling load at which cooling counts as sufficient for a rack restart."""
 
 
 @dataclass
 class Capacity:
-    """How much work fits into one step: B data centers."""
+    """Maximum work that B data centers can run in one step."""
 
     utilisation: F64 | float
-    """Highest work of each data center as a share of all its servers, 0..1, (B,) or for all."""
+    """Maximum work of each data center as a share of all its servers, 0..1, (B,) or a scalar."""
     bins: F64 | None
-    """Highest utilisation of each rack or server group, 0..1; None loads all of them freely."""
+    """Maximum utilisation of each bin (rack or server group), 0..1; None means no limit."""
 
 
 @dataclass
 class Placement:
-    """Work of one step in its place: B data centers, R racks, G server groups."""
+    """Placement of one step's work: B data centers, R racks, G server groups."""
 
     utilisation: F64
-    """Work that starts, as a share of all servers, 0..1, (B,)."""
+    """Started work as a share of all servers, 0..1, (B,)."""
     placed_utilisation: F64
-    """Work that found a place, as a share of all servers, (B,)."""
+    """Started work that is placed on servers, as a share of all servers, (B,)."""
     rack_load: F64 | None
-    """Utilisation of each rack while it is on, 0..1, (R,); None loads all racks alike."""
+    """Utilisation of each rack while it is on, 0..1, (R,); None loads all racks equally."""
     group_load: F64 | None
-    """Utilisation of each server group while it is on, 0..1, (G,); None spreads the load of a rack
-    over its servers by their load weights."""
+    """Utilisation of each server group while it is on, 0..1, (G,); None distributes the load of a
+    rack by the load weights of its servers."""
     rack_powered: F64 | None
-    """Share of the step that each rack is on, 0..1, (R,); None is all of it."""
+    """Share of the step during which each rack is on, 0..1, (R,); None means the whole step."""
 
 
 @dataclass
 class RackOutcome(RackQuantities):
-    """Results of one step of R racks in B data centers, from their work and inlets."""
+    """Status and work of R racks in B data centers after the thermal protection of a step."""
 
     restart_wait_min: F64
-    """Time for which tripped racks have been able to restart, in min, (R,); empty where no rack
-    ever trips."""
+    """Time for which each tripped rack has been able to restart, in min, (R,); empty if racks have
+    no protection."""
 
 
 class WorkAllocation:
-    """The racks of a fleet as places for work.
+    """Distributes work over the racks of a fleet, and applies their thermal protection.
 
-    Bins of work are racks with policy ``uniform``, which keeps the load weights within a rack, and
-    server groups with all others.
+    Work is placed in bins. With policy ``uniform``, which preserves the load weights within a rack,
+    the bins are racks; with all other policies they are server groups.
 
     Args:
         fleet: B data centers with R racks and G server groups.
@@ -104,21 +104,22 @@ class WorkAllocation:
         self._allowable_high_c = np.array([allowable_c(c)[1] for c in classes])
 
     def initial_wait_min(self) -> F64:
-        """``restart_wait_min`` before the first step, (R,), or empty where no rack ever trips."""
+        """Return ``restart_wait_min`` before the first step, (R,); empty without protection."""
         return np.zeros(self._fleet.racks if self._protected else 0)
 
     @property
     def watches_inlets(self) -> bool:
-        """Whether placement needs the inlets of the last step."""
+        """True if the placement policy reads the inlet temperatures of the last step."""
         return self._policy in ("coolest-first", "inlet-aware")
 
     def capacity(self, state: State, commands: Commands, surroundings: Surroundings) -> Capacity:
-        """How much work fits into a step.
+        """Return the maximum work of a step.
 
         Args:
-            state: State at the start of the step, with the status of each rack.
-            commands: Weights of the server groups; those of weight 0 take no work.
-            surroundings: How long each data center has power.
+            state: State at the start of the step, of which the status of each rack is read.
+            commands: Commands with the weights of the server groups; groups of weight 0 get no
+                work.
+            surroundings: Surroundings with the powered share of the step.
         """
         weights = commands.group_weights
         if weights is None and self._fully_on(state.rack_status, surroundings):
@@ -138,20 +139,20 @@ class WorkAllocation:
         work: WorkResult,
         capacity: Capacity,
     ) -> Placement:
-        """Put work in its place by the policy of the fleet.
+        """Place the started work on racks or server groups by the policy of the fleet.
 
         Args:
-            state: State at the start of the step, with the inlets if the policy watches them.
-            commands: Weights of the server groups.
-            surroundings: How long each data center has power.
-            work: Work that starts.
-            capacity: How much of it fits.
+            state: State at the start of the step, of which status and inlets are read.
+            commands: Commands with the weights of the server groups.
+            surroundings: Surroundings with the powered share of the step.
+            work: Work that starts in the step.
+            capacity: Maximum work of the step.
 
         Raises:
-            PlacementError: Weights that are negative, not finite, or all 0.
+            PlacementError: Weights are negative, not finite, or all 0.
         """
         rack_powered = self._rack_powered(state.rack_status, surroundings)
-        # Whole tasks may round to more than there are servers.
+        # Rounding to whole tasks can exceed the number of servers.
         utilisation = np.minimum(work.utilisation, 1.0)
         if self._per_rack and capacity.bins is None:
             return Placement(utilisation, work.utilisation, None, None, rack_powered)
@@ -182,15 +183,15 @@ class WorkAllocation:
         air: HallSums,
         plant: Mapping[str, Any],
     ) -> RackOutcome:
-        """Racks throttle, trip and restart by their hottest inlets and outlets.
+        """Throttle, trip and restart racks by their hottest inlets and outlets.
 
         Args:
-            state: State at the start of the step, with the status of each rack.
-            surroundings: Which CRAC units run, and what is left of the racks' fans.
-            work: Work that starts.
-            placement: Where it runs.
-            air: Hottest inlet and outlet of each rack.
-            plant: Cooling load, and what of it was not met.
+            state: State at the start of the step, of which the status of each rack is read.
+            surroundings: Surroundings with running CRAC units and rack fan failures.
+            work: Work that starts in the step.
+            placement: Placement of the work.
+            air: Hall results with the hottest inlet and outlet of each rack.
+            plant: Plant results by name, with total and unmet cooling load.
         """
         lost_share = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
         before, status = state.rack_status, state.rack_status.copy()
@@ -227,7 +228,7 @@ class WorkAllocation:
     def _restart(
         self, before: Status, wait_min: F64, inlet_max_c: F64, cooled: Mask
     ) -> tuple[Mask, F64]:
-        """Racks that start again in a step, and ``restart_wait_min`` at its end, each (R,)."""
+        """Return the racks that restart in a step, and the new ``restart_wait_min``, (R,) each."""
         wait_min = protection.ready_min(
             before, wait_min, inlet_max_c, cooled, restart_c=self._restart_c, dt=self._step_min
         )
@@ -236,36 +237,36 @@ class WorkAllocation:
         return restarts, np.where(restarts, 0.0, wait_min)
 
     def _racks_per_step(self) -> I64:
-        """Racks of each data center that may restart in a step, at least one, (B,)."""
+        """Return the maximum number of racks that may restart in a step, at least one, (B,)."""
         racks = np.diff(self._fleet.rack_offsets)
         share = self._fleet.values("protection.restart_share") * self._step_min
-        # The tolerance keeps what is a whole number of racks one.
+        # The tolerance absorbs round-off in products that are meant to be whole numbers.
         return np.maximum(np.floor(share * racks + 1e-9), 1.0).astype(np.int64)
 
     def _is_cooled(self, surroundings: Surroundings, plant: Mapping[str, Any]) -> Mask:
-        """Whether a CRAC unit of each data center runs and the plant keeps up with it, (B,)."""
+        """Return True for data centers with a running CRAC unit and sufficient cooling, (B,)."""
         any_runs = self._fleet.unit_sums(surroundings.unit_running) > 0
         load_w = np.abs(plant["cooling_load_w"])
         return np.asarray(any_runs & (plant["unmet_w"] <= UNMET_SHARE * load_w))
 
     def _fully_on(self, status: Status, surroundings: Surroundings) -> bool:
-        """Whether all racks are in order and on throughout the step."""
+        """Return True if all racks have normal status and power throughout the step."""
         return surroundings.fully_powered and not (self._protected and status.any())
 
     def _rack_powered(self, status: Status, surroundings: Surroundings) -> F64 | None:
-        """Share of the step that each rack is on, (R,); None if all are on throughout."""
+        """Return the share of the step during which each rack is on, (R,); None if all are on."""
         if self._fully_on(status, surroundings):
             return None
         return np.where(status == TRIPPED, 0.0, surroundings.powered[self._fleet.rack_dc])
 
     def _racks_in(self, status: Status, which: int) -> F64:
-        """Racks of each data center that have a status of ``hall.protection``, (B,)."""
+        """Count the racks of each data center with status ``which``, (B,)."""
         if not (self._protected and status.any()):
             return np.zeros(len(self._servers))
         return self._fleet.rack_sums(status == which)
 
     def _tripped_work(self, before: Status, after: Status, placement: Placement) -> F64:
-        """Work of the racks that trip in a step, as a share of all servers, (B,)."""
+        """Return the work lost on racks that trip in a step, as a share of all servers, (B,)."""
         fleet, tripped = self._fleet, (after == TRIPPED) & (before != TRIPPED)
         if not tripped.any():
             return np.zeros(fleet.size)
@@ -280,5 +281,5 @@ class WorkAllocation:
         return fleet.rack_sums(busy * tripped) / self._servers
 
     def _spread(self, per_rack: F64) -> F64:
-        """Rack values for each server group, (G,)."""
+        """Repeat rack values, (R,), for each server group, (G,)."""
         return np.repeat(per_rack, np.diff(self._fleet.group_offsets))

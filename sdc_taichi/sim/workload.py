@@ -1,9 +1,10 @@
-"""Delay-tolerant work of a step: what runs, waits, is due or dropped, and the queues after it.
+"""Delay-tolerant work of a step: started, queued, due and dropped work, and the queues.
 
-A queue is one row per data center: entry k is the work still queued that was put in by the end of
-step k, oldest step first. It never decreases along k, so length, due part and age histogram are
-read off it or are differences of two entries. Work is counted in tasks: 1 task is 1 % of the data
-center's capacity for one step. The models of ``plant.workload`` decide what enters and leaves.
+The queue of a data center is a cumulative sum by arrival step, oldest step first: entry k is the
+queued work that arrived up to the k-th step. The last entry is the length of the queue, one entry
+is the due work, and differences of entries give the ages. Work is counted in tasks: 1 task is 1 %
+of the data center's capacity during one step. The models of ``plant.workload`` decide which work
+enters and leaves the queue.
 """
 
 from __future__ import annotations
@@ -29,47 +30,47 @@ class QueueState:
     """The queues of a fleet at the end of a step."""
 
     queue: F64
-    """Work still queued by the step that put it in, oldest first, accumulated, in tasks, (B, L)."""
+    """Cumulative sum of the queued tasks by arrival step, oldest step first, (B, L)."""
     waiting_tasks: F64
-    """Work that waits, in tasks, (B,)."""
+    """Queued work, in tasks, (B,)."""
     due_tasks: F64
-    """Work that waits and is due when the next step begins, in tasks, (B,)."""
+    """Queued work that is due at the start of the next step, in tasks, (B,)."""
     oldest_age_steps: F64
-    """Age of the oldest work that waits, in steps, (B,)."""
+    """Age of the oldest queued work, in steps, (B,)."""
     mean_age_steps: F64
-    """Mean age of the work that waits, in steps, (B,)."""
+    """Mean age of the queued work, in steps, (B,)."""
 
 
 def due_entries(length: int, due_steps: F64) -> I32:
-    """Entry of each queue that holds the work that is due when a step begins, (B,).
+    """Return the index of each queue's entry that equals the due work at the start of a step, (B,).
 
-    It is ``length``, beyond the last entry, where work is never due.
+    If work is never due, the index is ``length``, one beyond the last entry.
 
     Args:
-        length: steps that a queue tells apart, L.
-        due_steps: age at which work is due, in steps, inf for never, (B,).
+        length: Number L of arrival steps that a queue distinguishes.
+        due_steps: Age at which work is due, in steps, inf for never, (B,).
     """
     due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
     return np.where(due_at < 0, length, due_at).astype(np.int32)
 
 
 def due_work(queue: F64, entries: I32) -> F64:
-    """Work that is due when a step begins, in tasks, (B,).
+    """Return the work that is due at the start of a step, in tasks, (B,).
 
     Args:
-        queue: work still queued by the step that put it in, oldest first, (B, L).
-        entries: what ``due_entries`` returned, (B,).
+        queue: Cumulative sum of the queued tasks by arrival step, oldest step first, (B, L).
+        entries: Return value of ``due_entries``, (B,).
     """
     never = np.zeros((1, len(entries)))
     return np.asarray(np.concatenate([queue.T, never])[entries, np.arange(len(entries))])
 
 
 class Queue:
-    """The queues of a fleet.
+    """Updates the queues of a fleet with a kernel.
 
     Args:
-        length: steps that a queue tells apart, L.
-        due_steps: age at which work is due, in steps, inf for never, (B,).
+        length: Number L of arrival steps that a queue distinguishes.
+        due_steps: Age at which work is due, in steps, inf for never, (B,).
     """
 
     def __init__(self, length: int, due_steps: F64) -> None:
@@ -77,18 +78,18 @@ class Queue:
         self._due_row = due_entries(length, due_steps)
         self._kernel: BoundKernel | None = None
         self._rows: Any = None
-        """The queue that the last step left, as ``vector_rows``."""
+        """Queue at the end of the last step, as ``vector_rows`` for the kernel."""
         self._last: F64 | None = None
-        """That queue as others see it, (B, L)."""
+        """View of ``_rows`` with shape (B, L), as returned to callers."""
         self._begin = (np.zeros(0), np.zeros(0))
-        """Work that waits and work that is due in the queue ``_last``, in tasks, each (B,)."""
+        """Queued work and due work of the queue ``_last``, in tasks, (B,) each."""
 
     def begin_step(self, queue: F64) -> tuple[F64, F64]:
-        """Work that waits when a step begins, and what of it is due, in tasks, each (B,).
+        """Return queued work and due work at the start of a step, in tasks, (B,) each.
 
         Args:
-            queue: work still queued by the step that put it in, oldest first, (B, L). It is made
-                read-only, since what is known of it would not follow a change.
+            queue: Cumulative sum of the queued tasks by arrival step, oldest step first, (B, L).
+                It becomes read-only, because the stored sums would not follow a change.
         """
         if queue is not self._last:
             due = due_work(queue, self._due_row)
@@ -97,18 +98,18 @@ class Queue:
         return self._begin
 
     def end_step(self, queue: F64, dequeued: F64, deferred: F64) -> QueueState:
-        """The queues at the end of a step.
+        """Update the queues and return them at the end of a step.
 
         Args:
-            queue: at its beginning, (B, L); read-only from here on.
-            dequeued: work that leaves it, oldest first, in tasks, (B,).
-            deferred: work that enters it, in tasks, (B,).
+            queue: Queues at the start of the step, (B, L); they become read-only.
+            dequeued: Work that leaves each queue, oldest first, in tasks, (B,).
+            deferred: Work that enters each queue, in tasks, (B,).
         """
         if queue is not self._last:
             self._load(queue)
         assert self._kernel is not None
         self._dequeued[:], self._deferred[:] = dequeued, deferred
-        # A step that is interrupted from here on leaves no queue.
+        # Invalid until the kernel has finished, in case the step is interrupted.
         self._last = None
         after = vector_rows(self._length, self._size)
         self._kernel(
@@ -122,37 +123,37 @@ class Queue:
             after,
             self._results,
         )
-        waiting, due, oldest_steps, mean_steps = self._found.copy()
+        waiting, due, oldest_steps, mean_steps = self._sums.copy()
         self._rows, self._last = after, unpadded(after, self._size).T
-        # A copy, since callers may do what they like with results.
-        self._begin = self._found[0].copy(), self._found[1].copy()
+        # A second copy, because callers can modify the returned arrays.
+        self._begin = self._sums[0].copy(), self._sums[1].copy()
         self._last.flags.writeable = False
         return QueueState(self._last, waiting, due, oldest_steps, mean_steps)
 
     def release(self) -> None:
-        """Drop the kernel and the arrays that it was last given."""
+        """Release the kernel and its arrays."""
         self._kernel = self._rows = self._last = None
 
     def _compile(self) -> None:
-        """Make the kernel, and the arrays that are the same in every step."""
+        """Create the kernel and the arrays that it uses in every step."""
         from sdc_taichi.kernels.compiler.launch import BoundKernel
         from sdc_taichi.kernels.queue import SERIAL_UP_TO, queue_kernel
 
         runtime.ensure_started()
         self._kernel = BoundKernel(queue_kernel(), templates=1)
         self._serial = self._size <= SERIAL_UP_TO
-        # Handing an array over takes longer than to copy a few entries.
+        # These arrays are bound once: passing a new array costs more than copying a few entries.
         self._moved, self._results = (vector_rows(n, self._size) for n in (2, 4))
         self._moved[:] = 0.0
         self._dequeued, self._deferred = unpadded(self._moved, self._size)
-        self._found = unpadded(self._results, self._size)
+        self._sums = unpadded(self._results, self._size)
         self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
         self._due_lanes.reshape(-1)[: self._size] = self._due_row
         self._empty = np.zeros(self._moved.shape[1], np.int32)
-        """First rows of each vector that hold nothing, which the kernel keeps up to date."""
+        """Number of leading rows without work in each vector, which the kernel updates."""
 
     def _load(self, queue: F64) -> None:
-        """Go on from a queue that the last step did not leave."""
+        """Copy in a queue that is not the result of the last step, such as that of a snapshot."""
         if self._kernel is None:
             self._compile()
         self._last = None
@@ -166,21 +167,21 @@ class Queue:
 
 @dataclass
 class WorkResult(QueueQuantities, Work):
-    """Work of one step of B data centers, and queues that tell L steps apart."""
+    """Work of one step of B data centers, and the queues at its end."""
 
     queue: F64
-    """Work in the queue by the step that put it in, oldest first, accumulated, (B, L)."""
+    """Cumulative sum of the queued tasks by arrival step, oldest step first, (B, L)."""
 
 
 def queue_limit_tasks(fleet: Fleet) -> F64:
-    """Longest queue of each data center, in tasks, (B,); ``UNLIMITED_TASKS`` without a limit."""
+    """Return the maximum queue of each data center, in tasks, (B,); ``UNLIMITED_TASKS`` if none."""
     limit_h = fleet.values("workload.queue_limit_h")
     limit_tasks = limit_h * (workload.TASKS_PER_STEP * fleet.steps_per_hour)
     return np.where(np.isnan(limit_h), workload.UNLIMITED_TASKS, limit_tasks)
 
 
 def due_steps(fleet: Fleet) -> F64:
-    """Age at which the work of each data center is due, in steps, inf for never, (B,)."""
+    """Return the age at which queued work is due, in steps, inf for never, (B,)."""
     deadline_h = fleet.values("workload.deadline_h")
     deadline_steps = np.rint(deadline_h * fleet.steps_per_hour)
     deadline_steps = np.where(np.isnan(deadline_h), np.inf, deadline_steps)
@@ -208,24 +209,25 @@ class Workload:
             lambda **x: fields_of(model.step(workload.WorkPoint(**x, **limits))), fleet.size
         )
         self._max_utilisation = v("workload.max_utilisation")
-        # One step for work that enters, one for all that is older than the horizon.
+        # Two entries more than the horizon: for arriving work, and for all older work together.
         self._length = int(np.max(np.rint(v("workload.age_horizon_h") * per_hour))) + 2
         self._queue = Queue(self._length, due_steps(fleet))
 
     def empty_queue(self) -> F64:
-        """Queues without work, (B, L)."""
+        """Return empty queues, (B, L)."""
         return np.zeros((self._size, self._length))
 
     def run(
         self, queue: F64, demand: F64, load_command: F64, max_utilisation: F64 | float
     ) -> WorkResult:
-        """Decide what happens to the work of a step, and take it to and from the queues.
+        """Run the workload model for a step and update the queues.
 
         Args:
-            queue: Work in the queue by the step that put it in, (B, L); read-only from here on.
-            demand: Work that arrives, as a share of capacity, 0..1, (B,).
+            queue: Queues at the start of the step, (B, L); they become read-only.
+            demand: Arriving work as a share of capacity, 0..1, (B,).
             load_command: Share to defer (below 0) or drain (above 0), -1..1, (B,).
-            max_utilisation: How much work the racks can take, as a share of all servers, (B,).
+            max_utilisation: Maximum work that the racks can run, as a share of all servers, (B,)
+                or one value for all.
         """
         waiting, due = self._queue.begin_step(queue)
         decided = self._decide(
@@ -245,5 +247,5 @@ class Workload:
         )
 
     def close(self) -> None:
-        """Let go of the kernel arrays."""
+        """Release the kernel arrays."""
         self._queue.release()
