@@ -123,10 +123,10 @@ class Queue:
             after,
             self._results,
         )
-        waiting, due, oldest_steps, mean_steps = self._sums.copy()
+        waiting, due, oldest_steps, mean_steps = self._statistics.copy()
         self._rows, self._last = after, unpadded(after, self._size).T
         # A second copy, because callers can modify the returned arrays.
-        self._begin = self._sums[0].copy(), self._sums[1].copy()
+        self._begin = self._statistics[0].copy(), self._statistics[1].copy()
         self._last.flags.writeable = False
         return QueueState(self._last, waiting, due, oldest_steps, mean_steps)
 
@@ -146,7 +146,7 @@ class Queue:
         self._moved, self._results = (vector_rows(n, self._size) for n in (2, 4))
         self._moved[:] = 0.0
         self._dequeued, self._deferred = unpadded(self._moved, self._size)
-        self._sums = unpadded(self._results, self._size)
+        self._statistics = unpadded(self._results, self._size)
         self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
         self._due_lanes.reshape(-1)[: self._size] = self._due_row
         self._empty = np.zeros(self._moved.shape[1], np.int32)
