@@ -70,14 +70,14 @@ SYSTEM_ARGUMENTS = {
     "beyond": Argument("i32", 2),  # cell beyond each face, N for no cell, (N + 1, 6)
     "off_diagonal": Argument("f64", 2),  # coefficient of the cell beyond, at least 0, (N + 1, 6)
     "diagonal": Argument("f64", 1),  # coefficient of the cell itself, (N,)
-    "front_offsets": Argument("i32", 1),  # first front face of each rack, and the end, (R + 1,)
+    "front_offsets": Argument("i32", 1),  # first front face of each rack, then the end, (R + 1,)
     "front_cell": Argument("i32", 1),  # cell before each front face
     "front_share": Argument("f64", 1),  # share of its rack's airflow, for each front face
-    "back_offsets": Argument("i32", 1),  # first back face of each rack, and the end, (R + 1,)
+    "back_offsets": Argument("i32", 1),  # first back face of each rack, then the end, (R + 1,)
     "back_cell": Argument("i32", 1),  # cell before each back face
     "back_m3s": Argument("f64", 1),  # airflow out of each back face, m3/s
     # The right sides.
-    "source_offsets": Argument("i32", 1),  # first source of each right side, and the end, (T + 1,)
+    "source_offsets": Argument("i32", 1),  # first source of each right side, then the end, (T + 1,)
     "source_cell": Argument("i32", 1),  # cell of each source
     "source": Argument("f64", 1),  # amount that each source adds to the right side
     # Work space.

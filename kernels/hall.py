@@ -258,7 +258,7 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     air.units_return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
     dc.crac_m3s_per_rack = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
-    # All mixes move by the midpoint of the exhausts' changes, up to half the spread of the changes.
+    # Each mix moves by the midpoint of the exhausts' changes, plus or minus half their spread.
     change_k = 0.5 * (total.least_change_k + total.most_change_k)
     spread_k = 0.5 * (total.most_change_k - total.least_change_k)
     exchanges = spread_k > ALIKE * hall.tolerance_k

@@ -344,7 +344,7 @@ def parcel_model(hall: ti.template(), n, chunk_at, servers: ti.template()):
 def advance_parcels(
     hall: ti.template(), n, chunk_at, block_terms_0, sweep: ti.template(), servers: ti.template()
 ):
-    """Advance the recirculated air before the racks of a chunk by a substep; store its heat.
+    """Advance the recirculated air before the racks of a chunk by a substep; store its heat uptake.
 
     Air enters a parcel of room air at the temperature of the mix and leaves at that of the parcel:
     C_parcel dT/dt = rho*cp*V_captured (T_mix - T).
@@ -397,7 +397,7 @@ def update_shift(hall: ti.template(), n, sweep, has_exchanged, change_k, exchang
 
     Most of the remaining change is the same for all racks and shrinks by the feedback gain in each
     sweep. The mixes therefore move by the whole expected change at once. The gain comes from the
-    table, or from the last sweep. Every PLAIN_EVERY sweeps, the shift is the plain step.
+    table, or from the last sweep. Every PLAIN_EVERY sweeps, the gain is set to 0 instead.
     """
     dc, shift_k = hall.dcs[n], hall.dcs[n].shift_k
     moved_k = change_k - dc.last_change_k

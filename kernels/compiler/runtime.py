@@ -97,7 +97,7 @@ def _bind(threads: set[int], count: int) -> None:
 
 
 CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
-"""Environment variable for Taichi's folder of compiled kernels, which this module also follows."""
+"""Environment variable with the path of Taichi's folder of compiled kernels."""
 LOCK_S = 60.0
 """Age of the folder's lock file, in s, from which it counts as the remnant of a killed process;
 Taichi holds the lock for milliseconds."""

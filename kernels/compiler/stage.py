@@ -150,7 +150,7 @@ class Trace:
         """Constants with a value per entry, each (n,)."""
 
     def argument(self, value: Any) -> Any:
-        """Return a traced quantity for an array or number, or a traced object for an object."""
+        """Return an argument as Traced (for an array or number) or as TracedObject."""
         if not isinstance(value, np.ndarray | float | int):
             return TracedObject(self, value)
         row, self.inputs = self.inputs, self.inputs + 1

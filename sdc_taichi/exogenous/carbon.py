@@ -19,7 +19,7 @@ from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_note
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 
 Pairing = Literal["local", "utc_rows"]
-"""Clock of the rows: moved to local standard time, or kept as if UTC were local time."""
+"""Treatment of UTC rows: moved to local standard time, or kept as if UTC were local time."""
 
 MAX_CI_G_PER_KWH = 2000.0
 """Highest valid carbon intensity, in g/kWh."""

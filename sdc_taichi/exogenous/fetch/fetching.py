@@ -33,7 +33,7 @@ from sdc_taichi.user_file import decoding
 
 @dataclass(frozen=True)
 class Destination:
-    """The site to which fetched data are added, and options of the download."""
+    """Site to which fetched data are added, with options for the download."""
 
     site: str
     """Name of the site."""

@@ -33,9 +33,9 @@ class GenerationType(_Record):
     """A type of generation of a service."""
 
     counts_as: str = Field(alias="as")
-    """Column of the carbon table to which the type counts, or ``storage``."""
+    """Column of the carbon table to which this type is added, or ``storage``."""
     names: tuple[str, ...] = ()
-    """First words of the type's names in tables that users saved."""
+    """Initial words of the type's names in tables that users saved."""
 
 
 class SavedTable(_Record):
