@@ -1,5 +1,5 @@
-"""The command line: one module per command, which reads arguments and prints results.
+"""Command line: one module per command, which parses arguments and prints results.
 
-Words, tables and exit codes live here; every figure comes from the packages below.
-Nothing outside this folder imports it, and no physics or file format is defined here.
+This package defines texts, tables and exit codes, and no physics or file formats; other packages
+compute all figures. No other package imports it.
 """

@@ -1,4 +1,4 @@
-"""The command ``sdc-taichi``: its commands, its errors and its exit codes."""
+"""The program ``sdc-taichi``: registration of its commands, errors and exit codes."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon,
   sdc-taichi data list                            sites and workload traces; data import adds yours
   sdc-taichi doctor                               what this machine has, and what is missing
   sdc-taichi --help                               all commands"""
-"""What a user who asks nothing may do next."""
+"""Text printed by ``sdc-taichi`` without arguments."""
 
 
 class _Commands(typer.core.TyperGroup):
-    """Commands whose errors are one line and an exit code."""
+    """Group of commands that reports an error as one line on stderr and an exit code."""
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> Any:
         words = sys.argv[1:] if args is None else list(args)
@@ -62,7 +62,7 @@ class _Commands(typer.core.TyperGroup):
         try:
             result = super().invoke(ctx)
             sys.stdout.flush()
-        except BrokenPipeError:  # Click would end the program with code 1.
+        except BrokenPipeError:  # without this, Click ends the program with exit code 1
             if not _is_reader_gone():
                 raise
             _drop_output()
@@ -94,14 +94,15 @@ app.command("collect")(collect_command)
 
 
 def main() -> None:
-    """Run the command line of this process, and exit."""
+    """Run the command that this process was started with, and exit."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    # The current folder, for import paths ``module:name``, after all that is installed.
+    # Import paths ``module:name`` may refer to modules in the current folder. It comes last, so
+    # that its files cannot hide installed modules.
     sys.path.append("")
     try:
         app()
-    except KeyboardInterrupt:  # between two commands, where Typer does not catch it
+    except KeyboardInterrupt:  # outside the part of the program where Typer catches it
         sys.exit(EXIT_INTERRUPTED)
 
 
@@ -128,9 +129,9 @@ def _options(
 
 
 def _print_error(error: Exception) -> int:
-    """Print one line on stderr and return the exit code."""
+    """Print an error as one line on stderr, and return the exit code."""
     if isinstance(error, typer.TyperException):
-        # Empty when help was shown because nothing was asked.
+        # The message is empty if Typer has shown the help text because of missing arguments.
         text, code = error.format_message(), error.exit_code
     elif isinstance(error, SdcError):
         text, code = str(error), EXIT_INPUT
@@ -148,7 +149,7 @@ def _print_error(error: Exception) -> int:
 
 
 def _is_reader_gone() -> bool:
-    """Whether the reader of standard output, such as ``head``, has ended before the output did."""
+    """Return True if the reader of standard output, such as ``head``, has exited."""
     try:
         print(flush=True)
     except BrokenPipeError:
@@ -157,5 +158,5 @@ def _is_reader_gone() -> bool:
 
 
 def _drop_output() -> None:
-    """Give standard output to the null device, where Python flushes it without another error."""
+    """Redirect standard output to the null device, so that Python's flush at exit succeeds."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

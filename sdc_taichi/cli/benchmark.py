@@ -1,4 +1,4 @@
-"""``sdc-taichi benchmark``: run suites of controllers, and report and extend their results."""
+"""``sdc-taichi benchmark``: run benchmark suites, report their results, and add results to them."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def _suites() -> list[str]:
 
 
 class _Suites(typer.core.TyperGroup):
-    """Commands of the benchmark, of which ``run`` may be left out before the name of a suite."""
+    """Group of the benchmark commands; ``benchmark SUITE`` is short for ``benchmark run SUITE``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse arguments, with ``run`` put in where no command is named."""
+        """Parse arguments, after inserting ``run`` if the first one is not a command."""
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = [_RUN, *args]
         return super().parse_args(ctx, args)
@@ -195,12 +195,14 @@ def add_command(
 
 
 def _names(text: str | None) -> list[str]:
-    """Names separated by commas; none without a text."""
+    """Split names at commas; an absent option gives an empty list."""
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def _require_torch(suite: Suite) -> None:
-    """Check that rows can be trained here, before optima are solved for a long time.
+    """Check that PyTorch is installed if rows of the suite learn.
+
+    The check comes before the optima are solved, which takes long.
 
     Raises:
         ConfigError: PyTorch is missing.

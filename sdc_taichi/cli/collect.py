@@ -1,4 +1,4 @@
-"""``sdc-taichi collect``: episodes of controllers as data sets for offline learning."""
+"""``sdc-taichi collect``: write episodes of controllers as data sets for offline learning."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def collect_command(
     base, label = read_config(source)
     configs = sites.data_centers(base)
     stem = name if name is not None else f"sdc_taichi/{_identifier(Path(label).stem)}"
-    names = _names(stem, configs)
+    names = _data_set_names(stem, configs)
     collections = [
         Collection(
             config=config,
@@ -105,37 +105,42 @@ def collect_command(
         )
         for config in configs
     ]
-    # Errors of the input are reported before the first episode.
-    for each in names:
-        data_set_folder(out, each, replace=force)
+    # Invalid input must fail before the first episode is simulated.
+    for data_set_name in names:
+        data_set_folder(out, data_set_name, replace=force)
     for collection in collections:
         collection.check()
     command = shlex.join(["sdc-taichi", *context.obj])
     done: list[str] = []
     with interruptible() as stop:
-        for collection, each in zip(collections, names, strict=True):
+        for collection, data_set_name in zip(collections, names, strict=True):
             try:
                 with stage_bars(shown=not quiet) as progress:
                     made = write_data_set(
                         collection,
                         out,
-                        each,
+                        data_set_name,
                         command=command,
                         replace=force,
                         progress=progress,
                         stop=stop,
                     )
             except StoppedError:
-                kept = f"; whole: {', '.join(done)}" if done else ""
-                print(f"interrupted; nothing of {each} is kept{kept}", file=sys.stderr)
+                whole = f"; whole: {', '.join(done)}" if done else ""
+                text = f"interrupted; nothing of {data_set_name} is kept{whole}"
+                print(text, file=sys.stderr)
                 raise typer.Exit(EXIT_INTERRUPTED) from None
-            done.append(each)
+            done.append(data_set_name)
             if not quiet:
                 _print_summary(made)
 
 
 def _environment(assigned: list[str]) -> dict[str, Any]:
-    """Options of the environment that ``--set`` gives."""
+    """Return the environment options of ``--set``, by name.
+
+    Args:
+        assigned: values of ``--set``, each ``environment.OPTION=VALUE``.
+    """
     from sdc_taichi.config import apply_override
 
     values: dict[str, Any] = {}
@@ -151,26 +156,26 @@ def _environment(assigned: list[str]) -> dict[str, Any]:
 
 
 def _agent_of(command: str | None) -> str | None:
-    """Name of the agent that gives a command."""
+    """Return the name of the agent that decides a command, such as ``load``; None for None."""
     from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
     return next((agent for agent, d in AGENT_DEFINITIONS.items() if d.command == command), None)
 
 
-def _names(stem: str, configs: list[DataCenterConfig]) -> list[str]:
-    """Name of the data set of each site."""
+def _data_set_names(stem: str, configs: list[DataCenterConfig]) -> list[str]:
+    """Return the name in Minari of the data set of each site, ``STEM-SITE-v0``."""
     from sdc_taichi.sim.fleet_configs import place_names
 
     return [f"{stem}-{_identifier(place)}-v0" for place in place_names(configs)]
 
 
 def _identifier(text: str) -> str:
-    """Text with ``_`` in place of characters that Minari accepts in no name."""
+    """Replace runs of characters that are invalid in Minari's names by ``_``."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text)
 
 
 def _print_summary(made: DataSet) -> None:
-    """Print the content and the place of a data set."""
+    """Print episodes, steps and mean return per controller, and the folder of a data set."""
     from sdc_taichi.benchmark.offline import CARD_FILE
 
     for name in made.collection.controllers:

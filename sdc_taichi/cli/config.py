@@ -1,4 +1,4 @@
-"""``sdc-taichi config`` and ``new``: show, check, list and begin configurations."""
+"""``sdc-taichi config`` and ``new``: show, check, list and create configurations."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def show_data(
 
 
 def _design_text(design: DesignConditions | None) -> str:
-    """Design conditions of a site in words; empty where it has none."""
+    """Return the design conditions of a site as text; empty if it has none."""
     if design is None:
         return ""
     extreme = design.extreme_outdoor_c
@@ -255,7 +255,12 @@ def import_data(
 
 
 def _mapping(mapped: list[str]) -> tuple[str | None, dict[str, str]]:
-    """Service whose layout ``--map`` names, or columns by ``NAME`` or ``NAME:UNIT``."""
+    """Parse the values of ``--map``.
+
+    Returns:
+        Name of the service whose table layout applies, or None; and columns of the file, keyed by
+        ``NAME`` or ``NAME:UNIT``.
+    """
     columns: dict[str, str] = {}
     for text in mapped:
         key, sign, column = text.partition("=")
@@ -283,7 +288,7 @@ def _import_tables(
     stamp: Stamp,
     utc_offset_h: float | None,
 ) -> importing.Imported:
-    """Import tables in the layout of a service."""
+    """Import tables that have the layout of a service."""
     from sdc_taichi.exogenous.fetch.saved_tables import find_service, import_saved_tables
 
     find_service(service)
@@ -295,7 +300,12 @@ def _import_tables(
 
 
 def _refuse_place(where: Mapping[str, float | None], path: Path) -> None:
-    """Refuse options of a weather table beside other files."""
+    """Raise ``DataError`` if options for weather tables are given with a file of another kind.
+
+    Args:
+        where: latitude, longitude and elevation; None if not given.
+        path: the file.
+    """
     options = [f"--{option}" for option, value in where.items() if value is not None]
     if options:
         raise DataError(
@@ -306,7 +316,17 @@ def _refuse_place(where: Mapping[str, float | None], path: Path) -> None:
 def _place(
     name: str, path: Path, utc_offset_h: float | None, where: Mapping[str, float | None]
 ) -> Place:
-    """Where the station of a weather table is."""
+    """Return the place of the weather station of a weather table.
+
+    Args:
+        name: name of the site.
+        path: the weather table, for messages.
+        utc_offset_h: UTC offset of the station, in h; None if not given.
+        where: latitude and longitude in degrees, elevation in m; None if not given.
+
+    Raises:
+        DataError: a value is missing.
+    """
     options = {**where, "utc-offset": utc_offset_h}
     if missing := [f"--{option}" for option, value in options.items() if value is None]:
         raise DataError(f"{path}: a weather table, expected {', '.join(missing)} of its station")
@@ -317,7 +337,11 @@ def _place(
 def _plan_import(
     path: Path, site: str | None, columns: Mapping[str, str]
 ) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
-    """Kind, file and name of each import, and the files that are left out, with the reasons."""
+    """Determine what to import from a file or a folder.
+
+    Returns:
+        Kind, file and site or trace name of each import; and each omitted file with the reason.
+    """
     if os.path.isdir(path):
         if columns:
             raise DataError(f"--map: names columns of one file, but {path} is a folder")

@@ -1,4 +1,4 @@
-"""``sdc-taichi data fetch``: weather and carbon intensity from public services."""
+"""``sdc-taichi data fetch``: download weather and carbon intensity from public services."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ fetch_app = CommandApp(
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """The site that a download is imported as."""
+    """Options for the site under whose name a download is imported."""
 
     site: Annotated[
         str,
@@ -40,10 +40,10 @@ class TargetOptions:
     )
 
     def fetch(self, fetch: Callable[[Destination], Imported]) -> None:
-        """Fetch with a progress bar, and print what was imported.
+        """Run a download with a progress bar, and print what was imported.
 
         Args:
-            fetch: imports into its argument.
+            fetch: function that downloads and imports into the given destination.
         """
         from sdc_taichi.exogenous.fetch.fetching import Destination
 
@@ -63,7 +63,7 @@ class TargetOptions:
 
 @dataclass(frozen=True)
 class YearOptions:
-    """The year of a series of carbon intensity, and the time zone of its site."""
+    """Options for the year of a carbon-intensity series, and for the time zone of its site."""
 
     year: Annotated[
         int,
@@ -173,7 +173,7 @@ def fetch_electricity_maps_command(
 
 
 def print_imported(console: PlainConsole, item: Imported) -> None:
-    """Print what a file was imported as, with its repairs and warnings."""
+    """Print kind, name and path of an imported file, with notes on repairs and warnings."""
     console.print(
         f"{item.kind} {item.name}: {item.source.name} -> {item.target}",
         soft_wrap=True,
@@ -183,7 +183,13 @@ def print_imported(console: PlainConsole, item: Imported) -> None:
 
 
 def print_missing_parts(console: PlainConsole, done: Sequence[Imported], base: str | None) -> None:
-    """Print, for each imported site without weather or carbon, the source of that part."""
+    """Print which input each imported site lacks, and where that input comes from.
+
+    Args:
+        console: console to print on.
+        done: imported files.
+        base: embedded site that supplies missing inputs; None without ``--base``.
+    """
     for name in dict.fromkeys(item.name for item in done if item.kind != "workload"):
         missing = {"weather", "carbon"} - set(imported_sites().get(name, {}))
         if not missing:

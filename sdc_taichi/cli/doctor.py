@@ -1,4 +1,4 @@
-"""``sdc-taichi doctor``: what of the package works on this machine, and what is missing."""
+"""``sdc-taichi doctor``: check which parts of the package work on this machine."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from sdc_taichi.errors import SdcError, one_line
 
 
 class Extra(NamedTuple):
-    """An optional part of the package."""
+    """An optional dependency group (extra) of the package."""
 
     modules: tuple[str, ...]
-    """Modules that it installs."""
+    """Names of the modules that the extra installs."""
     purpose: str
-    """What it is for."""
+    """What the extra is needed for, as text."""
 
 
 EXTRAS = {
@@ -38,21 +38,21 @@ EXTRAS = {
     "scale": Extra(("ray",), "jobs on a cluster (--ray)"),
     "offline": Extra(("minari", "h5py"), "data sets of episodes (collect)"),
 }
-"""Extras that users install, by name."""
+"""Extras that users can install with ``pip install "sdc-taichi[NAME]"``, by name."""
 _LIBRARIES = ("taichi", "numpy", "pandas", "pyarrow", "gymnasium", "pettingzoo", "rerun-sdk")
 
 
 class Finding(NamedTuple):
-    """State of a thing that the package uses."""
+    """Result of one check, such as of a library or a folder."""
 
     what: str
-    """Name of the thing."""
+    """Name of the checked item."""
     found: str
-    """Its state."""
+    """State of the item, as text."""
     advice: str = ""
-    """How to install or mend it; empty if nothing is missing."""
+    """How to install or repair the item; empty if nothing is missing."""
     is_broken: bool = False
-    """Whether the simulator cannot run in this state."""
+    """True if the simulator cannot run in this state."""
 
 
 def doctor_command(
@@ -81,7 +81,7 @@ def doctor_command(
 
 
 def _versions() -> Iterator[Finding]:
-    """Versions of the package, Python, the system and the main libraries."""
+    """Yield the versions of the package, Python, the operating system and the main libraries."""
     yield Finding("sdc-taichi", metadata.version("sdc-taichi"))
     yield Finding("Python", f"{platform.python_version()}, {sys.executable}")
     yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}")
@@ -90,7 +90,7 @@ def _versions() -> Iterator[Finding]:
 
 
 def _extras() -> Iterator[Finding]:
-    """Extras, and whether all their modules are installed."""
+    """Yield for each extra of the package whether all its modules are installed."""
     for name, extra in EXTRAS.items():
         is_whole = all(util.find_spec(module) for module in extra.modules)
         advice = "" if is_whole else f'pip install "sdc-taichi[{name}]"'
@@ -99,7 +99,7 @@ def _extras() -> Iterator[Finding]:
 
 
 def _machine() -> Iterator[Finding]:
-    """Processors, folders that the package writes to, and the viewer of recordings."""
+    """Yield the state of processors, writable folders, and the viewer of recordings."""
     from sdc_taichi.cli.view import viewer_program
     from sdc_taichi.exogenous.registry import user_data_dir
     from sdc_taichi.kernels.compiler.runtime import (
@@ -122,7 +122,13 @@ def _machine() -> Iterator[Finding]:
 
 
 def _folder(what: str, folder: Path, variable: str) -> Finding:
-    """Whether files can be written to a folder, or to the one that it would be made in."""
+    """Check that files can be written to a folder, or to its closest existing parent.
+
+    Args:
+        what: content of the folder, such as ``compiled kernels``.
+        folder: path of the folder, which need not exist.
+        variable: environment variable with which users choose another folder.
+    """
     parent = next(each for each in (folder, *folder.parents) if each.exists())
     try:
         with tempfile.TemporaryFile(dir=parent):
@@ -134,7 +140,7 @@ def _folder(what: str, folder: Path, variable: str) -> Finding:
 
 
 def _keys() -> Iterator[Finding]:
-    """Keys of services, and whether they are set."""
+    """Yield for each API key of a data service whether its environment variable is set."""
     from sdc_taichi.exogenous.fetch.services import services
 
     keys = {name: service.key for name, service in services().items() if service.key is not None}
@@ -146,7 +152,7 @@ def _keys() -> Iterator[Finding]:
 
 
 def _first_step() -> Finding:
-    """Whether a small hall can be stepped, and how long that takes."""
+    """Simulate one step of a small hall, and report the time or the error."""
     begun = time.perf_counter()
     try:
         from sdc_taichi.config import load_config

@@ -1,4 +1,4 @@
-"""``sdc-taichi evaluate``: policies and other controllers in weeks that were not trained in."""
+"""``sdc-taichi evaluate``: compare policies and controllers in held-out weeks."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def evaluate_command(
     configs = sites.data_centers(base)
     if objective is None:
         objective = "carbon" if settings is None else settings.validation.objective
-    # Solving for the optimum may take hours, so invalid names and policies are refused before.
+    # Invalid names and policies must fail before solving for the optimum, which may take hours.
     with warnings.catch_warnings(action="ignore"):
         check_contenders(_contenders(build_fleet(configs), folders, named))
     if out is not None:
@@ -172,7 +172,13 @@ def evaluate_command(
 def _base_config(
     settings: TrainingSettings | None, config: str | None, overrides: list[str] | None
 ) -> DataCenterConfig:
-    """The data center of ``--config``, or that of a training, with overrides."""
+    """Return the config of ``--config``, or that of a training, with overrides applied.
+
+    Args:
+        settings: settings of the training; None with ``--config`` or without a training.
+        config: preset or file of ``--config``; None without it.
+        overrides: values of ``--set``.
+    """
     if settings is None:
         return read_config([] if config is None else [config], overrides)[0]
     return apply_overrides(settings.data_centers_of_sites()[0], overrides or [])
@@ -186,10 +192,12 @@ def _prepared(
     stop: Callable[[], bool],
     **options: Any,
 ) -> DataCenterWeeks:
-    """The weeks, without an optimum and with a note on stderr where it cannot be solved for.
+    """Prepare the weeks of an evaluation, and solve for their optimum if asked.
+
+    If there is no optimum, a note on stderr gives the reason, and the weeks have none.
 
     Raises:
-        typer.Exit: solving was stopped; a message says which results are stored.
+        typer.Exit: the user stopped the solver; a message on stderr lists the stored results.
     """
     from sdc_taichi.learning.evaluation import prepare
     from sdc_taichi.optimum import StoppedError
@@ -215,7 +223,16 @@ def _evaluated(
     quiet: bool,
     stop: Callable[[], bool],
 ) -> Evaluation:
-    """Run policies and named controllers, with a progress bar for each run."""
+    """Evaluate policies and named controllers, with a progress bar for each run.
+
+    Args:
+        weeks: the prepared weeks.
+        folders: folders of policies.
+        named: names of controllers.
+        agents_alone: True to also evaluate each agent of a policy alone.
+        quiet: True to show no progress.
+        stop: function that returns True after an interruption.
+    """
     from sdc_taichi.learning.evaluation import evaluate
 
     print_notes(weeks.sim.drivers.notes)
@@ -231,7 +248,7 @@ def _evaluated(
 def _contenders(
     fleet: Fleet, folders: Sequence[Path], named: Sequence[str], *, agents_alone: bool = True
 ) -> list[Contender]:
-    """Policies and named controllers for data centers."""
+    """Return the policies and controllers to evaluate, built for the data centers of a fleet."""
     from sdc_taichi.control import make_controller
     from sdc_taichi.learning.evaluation import Contender, contenders_of
 
