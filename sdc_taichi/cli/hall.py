@@ -1,4 +1,4 @@
-"""``sdc-taichi hall``: describe a hall, solve its air, and let parts of its cooling fail."""
+"""``sdc-taichi hall``: describe a hall, solve its airflow, and simulate failures of its cooling."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ def solve_hall(
 
 
 def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:
-    """A solved hall as plain values for JSON.
+    """Return the solution of a hall's airflow as plain values for JSON.
 
-    Units are in the keys; lists per rack are in the order of the racks, row by row.
+    Keys end with the unit. Lists have one value per rack, row by row.
     """
     inner, outer = _row_means(config, solution.approach_k)
     values = {each.name: getattr(solution, each.name) for each in fields(solution)}
@@ -121,7 +121,7 @@ def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -
 
 
 def _row_means(config: DataCenterConfig, values: F64) -> tuple[float | None, float]:
-    """Means over the inner and over the two outer rows; None without inner rows."""
+    """Return the mean of rack values over the inner rows (None without any), and the outer rows."""
     rows = values.reshape(config.hall.rows, -1)
     outer = np.concatenate([rows[:1], rows[1:][-1:]])
     inner = rows[1:-1]
@@ -162,7 +162,7 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
 
 
 LISTED = 30
-"""Most losses that the table on the screen lists."""
+"""Largest number of losses in the table that ``hall failover`` prints."""
 
 
 @hall_app.command("failover")
@@ -209,7 +209,7 @@ def failover_command(
 
 
 def _print_study(study: Failover) -> None:
-    """Print what was studied, and a table of the worst losses."""
+    """Print the conditions of a failover study, and a table of the worst losses."""
     from sdc_taichi.run.failover import MINUTES, SHOWN_AFTER_MIN, failover_rows
 
     hall = study.config.hall
@@ -240,13 +240,13 @@ def _print_study(study: Failover) -> None:
 
 
 LISTED_ROWS = 12
-"""Number of rows up to which all are listed; of larger halls the hottest rows are."""
+"""Largest number of rows that ``describe_hall`` lists; larger halls list only the hottest rows."""
 LISTED_UNITS = 8
-"""Number of CRAC units up to which each has a line of its own."""
+"""Largest number of CRAC units for which ``describe_hall`` has a line each."""
 
 
 def describe_hall(design: DesignHall) -> str:
-    """Room, CRAC units, air and rows of a hall at its design point, as lines of text."""
+    """Return a text about room, CRAC units, air and rows of a hall at its design point."""
     return "\n".join(
         [*_room_lines(design), *_unit_lines(design), *_air_lines(design), *_rows(design)]
     )
@@ -274,7 +274,7 @@ def _room_lines(design: DesignHall) -> list[str]:
 
 
 def _type_lines(design: DesignHall) -> list[str]:
-    """A line for each type of racks: how many, and what one of them draws at the design point."""
+    """Return a line for each rack type: number of racks, and power and airflow of one rack."""
     hall = design.config.hall
     named = np.array(hall.rack_type_names())
     rise_k = design.outlet_c - design.inlet_c

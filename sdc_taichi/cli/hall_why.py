@@ -1,4 +1,4 @@
-"""``sdc-taichi hall why``: whose exhaust, and what else, makes the inlet of a rack warm."""
+"""``sdc-taichi hall why``: explain the inlet temperature of a rack as a sum of its causes."""
 
 from __future__ import annotations
 
@@ -86,12 +86,16 @@ def why_command(
         typer.echo(f"Floor plan: {printable(out)}")
 
 
-_Found = tuple[str, DataCenterConfig, str, Inlets]
-"""Name of a data center, its config, when its inlets are as they are, and the inlets."""
+_Explained = tuple[str, DataCenterConfig, str, Inlets]
+"""Name of a data center, its config, the moment of its inlets as text, and the inlets."""
 
 
 def _run_folder(source: list[str] | None) -> Path | None:
-    """The folder of a run, where the arguments name one alone."""
+    """Return the run folder that the arguments name, or None if they name a preset or file.
+
+    Raises:
+        ConfigError: there are further arguments after the run folder.
+    """
     folders = [text for text in source or [] if os.path.isdir(text)]
     if not folders:
         return None
@@ -102,8 +106,8 @@ def _run_folder(source: list[str] | None) -> Path | None:
 
 def _at_design_point(
     source: list[str] | None, overrides: list[str] | None, dc: str | None, step: int | None
-) -> _Found:
-    """Inlets at the design point of a config."""
+) -> _Explained:
+    """Compute the inlets at the design point of a config."""
     from sdc_taichi.sim.design_hall import solve_design_hall
 
     for option, value in (("--dc", dc), ("--step", step)):
@@ -113,8 +117,10 @@ def _at_design_point(
     return config.name, config, "at its design point", solve_design_hall(config).inlets
 
 
-def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int | None) -> _Found:
-    """Inlets in a step of a run."""
+def _in_run(
+    folder: Path, overrides: list[str] | None, dc: str | None, step: int | None
+) -> _Explained:
+    """Read or simulate the inlets of a data center at the end of a step of a run."""
     from sdc_taichi.run.folder_reader import is_number, read_run
     from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
 
@@ -140,7 +146,7 @@ def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int
 
 
 def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:
-    """Draw the floor plan, racks coloured by what their exhaust adds to the inlet."""
+    """Draw the floor plan, with each rack coloured by the warming that its exhaust causes, in K."""
     from sdc_taichi.viz.floor_plan_figure import RackValues, floor_plan_figure
     from sdc_taichi.viz.plotting import save_picture
 
@@ -155,10 +161,10 @@ def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:
 
 
 def rack_number(text: str, hall: HallConfig) -> int:
-    """Index of a rack that a user names by number or as ROW:PLACE.
+    """Return the index of a rack from a text with its number or with ROW:PLACE.
 
     Raises:
-        ConfigError: no such rack.
+        ConfigError: the hall has no such rack.
     """
     row, colon, place = text.strip().partition(":")
     try:
@@ -175,7 +181,7 @@ def rack_number(text: str, hall: HallConfig) -> int:
 
 
 def describe_inlet(parts: InletParts, racks_per_row: int) -> str:
-    """The inlet of a rack as a sum, and why exhaust reaches it, as lines of text."""
+    """Return a text about the terms of a rack's inlet temperature, and why exhaust reaches it."""
     (first, setpoint_c), *others = inlet_terms(parts, racks_per_row)
     lines = [
         f"{rack_text(parts.rack, racks_per_row)}, server {parts.server} of {parts.servers} from "

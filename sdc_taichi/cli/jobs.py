@@ -1,4 +1,4 @@
-"""Options that say where jobs run, and a study of jobs with its progress and its end."""
+"""Options for where jobs run, and sessions that run the jobs of a study with progress."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-]+:\d+|(ray://)?\[[0-9a-fA-F:.
 
 
 class JobsCommand(typer.core.TyperCommand):
-    """A command with ``JobOptions``; the value of ``--ray`` may be left out."""
+    """Command with ``JobOptions``, in which the value of ``--ray`` is optional."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse arguments, with the value of ``--ray`` put in where it is left out."""
+        """Parse arguments, after inserting the default value of ``--ray`` if it is missing."""
         return super().parse_args(ctx, with_ray_address(args))
 
 
 def with_ray_address(args: list[str]) -> list[str]:
-    """Arguments of a command, with ``local`` after each ``--ray`` that no address follows.
+    """Insert ``local`` after each ``--ray`` that is not followed by an address.
 
     Args:
         args: arguments of a command line.
@@ -57,9 +57,9 @@ def with_ray_address(args: list[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class JobOptions:
-    """Where jobs run, and whether an interrupted study is resumed.
+    """Options for where jobs run, and whether to resume an interrupted study.
 
-    A command with these options is a ``JobsCommand``.
+    A command with these options must be a ``JobsCommand``.
     """
 
     jobs: Annotated[
@@ -87,10 +87,10 @@ class JobOptions:
     ] = False
 
     def executor(self) -> Executor:
-        """The executor that runs the jobs.
+        """Create the executor that runs the jobs.
 
         Raises:
-            SdcError: options that are not valid together, or no Ray.
+            SdcError: the options contradict each other, or Ray is not installed.
         """
         if self.ray is not None:
             from sdc_taichi.benchmark.ray_cluster import RayCluster
@@ -102,13 +102,13 @@ class JobOptions:
 
 
 class JobSession:
-    """A running study: its jobs run in stages, with progress on stderr.
+    """Running study, which executes its jobs in stages and shows progress on stderr.
 
     Args:
-        store: folder of the results, which is claimed.
-        executor: what runs the jobs.
-        stop: says whether the user has interrupted the command.
-        shown: whether progress is shown.
+        store: folder of the results, claimed by this process.
+        executor: executor that runs the jobs.
+        stop: function that returns True after the user has interrupted the command.
+        shown: True to show progress.
     """
 
     def __init__(
@@ -116,19 +116,19 @@ class JobSession:
     ) -> None:
         self.store = store
         self.summaries: list[JobSummary] = []
-        """Summary of the jobs of each stage that has ended."""
+        """Summaries of the jobs of the finished stages."""
         self._executor, self._stop, self._shown = executor, stop, shown
 
     def run(
         self, stage: str, jobs: Iterable[Job], total: int, inputs: Inputs | None = None
     ) -> JobSummary:
-        """Run the jobs of a stage that are not done. After an interruption it runs none.
+        """Run the jobs of a stage whose results are missing; run none after an interruption.
 
         Args:
-            stage: name of the stage, for the progress, such as ``rows``.
-            jobs: the jobs.
+            stage: name of the stage, such as ``rows``, for the progress display.
+            jobs: all jobs of the stage.
             total: number of the jobs.
-            inputs: content of inputs by name.
+            inputs: contents of shared inputs of the jobs, by name.
 
         Raises:
             SdcError: a result cannot be written, or two jobs have the same partition.
@@ -153,10 +153,10 @@ class JobSession:
         return all(each.is_whole for each in self.summaries)
 
     def finish(self) -> None:
-        """Say on stderr what is missing, and end the command if anything is.
+        """End the command with an error code and a message if results are missing.
 
         Raises:
-            typer.Exit: jobs failed, or were left out because of an interruption.
+            typer.Exit: jobs failed, or did not run because of an interruption.
         """
         failed = sum(len(each.failed) for each in self.summaries)
         whole = sum(each.done + each.kept for each in self.summaries)
@@ -173,19 +173,19 @@ class JobSession:
 def job_session(
     store: ResultStore, study: Study, options: JobOptions, *, quiet: bool = False
 ) -> Iterator[JobSession]:
-    """Begin or resume a study, and at the end release its workers and its folder.
+    """Begin or resume a study, and release its workers and its folder at the end.
 
     Args:
         store: folder of the study.
-        study: what is to be done.
-        options: where the jobs run, and whether the study in the folder is resumed.
-        quiet: whether to show neither progress nor notes.
+        study: description of the study and its jobs.
+        options: options for where jobs run, and whether to resume the study in the folder.
+        quiet: True to show neither progress nor notes.
 
     Yields:
-        The running study, whose jobs end at Ctrl-C.
+        The running study, which Ctrl-C stops.
 
     Raises:
-        SdcError: the folder is not free, or options are not valid.
+        SdcError: the folder is in use or has other content, or the options are not valid.
     """
     executor, resume = options.executor(), options.resume
     with interruptible() as stop, executor, store.claimed(study, resume=resume) as notes:
@@ -198,17 +198,18 @@ def job_session(
 def job_progress(
     stage: str, total: int, *, shown: bool
 ) -> Iterator[Callable[[Job, DoneJob | None], None]]:
-    """Show on stderr how many jobs have ended: a bar in a terminal, lines elsewhere.
+    """Show the number of finished jobs on stderr, as a bar in a terminal or as lines elsewhere.
 
-    A job that fails has a line in any case.
+    Every failed job is printed on a line of its own.
 
     Args:
-        stage: name of what the jobs do.
+        stage: name of the stage.
         total: number of jobs.
-        shown: whether to show more than the jobs that fail.
+        shown: True to show progress, False to print failed jobs only.
 
     Yields:
-        A function to call with each job and how it ended; None if its result was stored before.
+        A function to call with each job and its outcome. The outcome is None if the result was
+        already stored.
     """
     lines, has_lines = ProgressLines(), shown and not sys.stderr.isatty()
     ended = kept = 0

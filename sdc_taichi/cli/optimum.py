@@ -1,4 +1,4 @@
-"""``sdc-taichi optimum``: a bound for all controllers, and a figure that has been reached."""
+"""``sdc-taichi optimum``: compute a lower bound for all controllers and an achieved figure."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 MOST_LINES = 12
-"""Largest number of remarks on single data centers that are printed."""
+"""Largest number of printed remarks about single data centers."""
 
 
 def optimum_command(
@@ -113,8 +113,8 @@ def optimum_command(
     fleet.require_distinct_names()
     error = run.error()
     named = {name: make_controller(name, fleet) for name in controller or ()}
-    for name, each in named.items():
-        _require_movable(name, each, movable)
+    for name, named_controller in named.items():
+        _require_movable(name, named_controller, movable)
     if out is not None:
         prepare_folder(out, force=force)
     with Simulator(fleet, precision=run.precision) as sim, interruptible() as interrupted:
@@ -176,17 +176,18 @@ def solve_beside(
         sim: the simulator.
         objective: what to minimise.
         steps: number of steps.
-        seed: of the sampled events.
-        agents: what may be moved; None is all.
-        scored_from: first step that counts.
-        inlet_limit_c: hottest inlet to allow, in C; None is that of ``protection.ashrae_class``.
-        cache: whether to read and keep results.
-        quiet: whether to show no progress.
-        stop: asked now and then; true ends the work.
+        seed: seed of the sampled events.
+        agents: agents whose commands are optimised; None is all.
+        scored_from: first step that counts in the objective.
+        inlet_limit_c: hottest allowed inlet, in C; None is the limit of
+            ``protection.ashrae_class``.
+        cache: True to read stored results and to store new ones.
+        quiet: True to show no progress.
+        stop: function that is called regularly; the work ends when it returns True.
 
     Raises:
-        typer.Exit: it was stopped; a message says which results are stored.
-        SdcError: there is no optimum of these.
+        typer.Exit: the user stopped the solver; a message on stderr lists the stored results.
+        SdcError: there is no optimum for these data centers and inputs.
     """
     from sdc_taichi.optimum import solve
     from sdc_taichi.optimum.problem import AGENTS
@@ -217,7 +218,7 @@ def _run_controllers(
     quiet: bool,
     stop: Callable[[], bool],
 ) -> list[Achievement]:
-    """Figure and share of each controller whose run was not stopped."""
+    """Run controllers, and return figure and share of the achievable of each complete run."""
     from sdc_taichi.run.achievable import run_beside
 
     reached = []
@@ -239,7 +240,12 @@ def _run_controllers(
 
 
 def _print_interruption(missing: list[str], out: Path | None) -> None:
-    """Say on stderr what an interrupted command did not do; the printed figures are complete."""
+    """Print on stderr which results are missing after an interruption.
+
+    Args:
+        missing: names of controllers without a figure.
+        out: run folder that was not written; None if it was, or without ``--out``.
+    """
     left = [f"controllers {', '.join(missing)}"] if missing else []
     left += [f"files in {printable(out)}"] if out is not None else []
     text = f"; without {' and '.join(left)}" if left else ""
@@ -247,7 +253,7 @@ def _print_interruption(missing: list[str], out: Path | None) -> None:
 
 
 def _agents(text: str) -> tuple[Agent, ...]:
-    """Agents that option ``--agents`` names, in the order of ``AGENTS``."""
+    """Parse the value of ``--agents``, and return its agents in the order of ``AGENTS``."""
     from sdc_taichi.optimum.problem import AGENTS
 
     names = [name.strip() for name in text.split(",")]
@@ -261,7 +267,7 @@ def _agents(text: str) -> tuple[Agent, ...]:
 
 
 def _require_movable(name: str, controller: Controller, movable: tuple[Agent, ...]) -> None:
-    """Refuse a controller that moves more than the optimum that it is compared with."""
+    """Raise ``ConfigError`` if a controller decides commands that the optimum leaves idle."""
     from sdc_taichi.control import commands_of
 
     more = [command for command in commands_of(controller) if command not in movable]
@@ -273,7 +279,7 @@ def _require_movable(name: str, controller: Controller, movable: tuple[Agent, ..
 
 
 def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:
-    """Number of steps of ``--warm-up``."""
+    """Return the number of steps of ``--warm-up``, which must be less than ``steps``."""
     if days == 0.0:
         return 0
     count = whole_steps(days, steps_per_hour, "--warm-up")
@@ -283,7 +289,7 @@ def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:
 
 
 def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
-    """Print the figures of an optimum, and what they are.
+    """Print the table of figures of an optimum, and remarks about them.
 
     Args:
         content: content of optimum.json.
@@ -318,7 +324,12 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
 
 
 def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[float | None]:
-    """Values of the rows of a data center, or of all."""
+    """Return the column of the table for a data center, or for all data centers.
+
+    Args:
+        figures: figures of the data center, or of all, in optimum.json.
+        shares: share of the achievable of each controller.
+    """
     idle = figures["idle"]
 
     def change_pct(value: float | None) -> float | None:

@@ -1,7 +1,7 @@
-"""Options that several commands share, groups of options, and their values.
+"""Options and groups of options that several commands share, and functions that read them.
 
-A group of options is a dataclass whose fields are options. A command names the group as the type
-of a parameter, and ``CommandApp`` gives it one option for each field.
+A group of options is a dataclass whose fields are options. A command has a parameter with the group
+as its type, and ``CommandApp`` gives the command one option for each field.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 CommandFunction = TypeVar("CommandFunction", bound=Callable[..., None])
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
-"""Option of every command, which ``app`` looks for among the arguments."""
+"""Option of every command; the module ``app`` searches the arguments for it after an error."""
 
 
 class CommandApp(typer.Typer):
-    """Commands whose parameters may be groups of options, each with the option ``--debug``."""
+    """Set of commands that may have groups of options, and all have the option ``--debug``."""
 
     def command(
         self, name: str | None = None, **settings: Any
@@ -52,7 +52,7 @@ class CommandApp(typer.Typer):
 
 
 def _flattened(function: Callable[..., None]) -> Callable[..., None]:
-    """The function of a command, its groups replaced by an option for each field."""
+    """Wrap the function of a command, replacing each group of options by its fields."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
@@ -81,7 +81,7 @@ def _flattened(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _parameters_of(group: type[Any]) -> list[inspect.Parameter]:
-    """A keyword parameter for each field of a group of options."""
+    """Return one keyword parameter for each field of a group of options."""
     types = get_type_hints(group, include_extras=True)
     missing, required = dataclasses.MISSING, inspect.Parameter.empty
     return [
@@ -96,9 +96,12 @@ def _parameters_of(group: type[Any]) -> list[inspect.Parameter]:
 
 
 def completed_by(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Completion of a word of the command line: names that begin with it.
+    """Return a function that completes a word of the command line to names that begin with it.
 
-    If there are none, shells offer files.
+    If no name begins with the word, shells offer files.
+
+    Args:
+        names: function that returns all names.
     """
 
     def complete(incomplete: str) -> list[str]:
@@ -114,14 +117,14 @@ def _presets_and_fields() -> list[str]:
 
 
 def _controllers() -> Iterable[str]:
-    """Names of controllers; for those with a value, the part up to the colon."""
+    """Return the names of controllers, up to the colon for names with a value (``constant:C``)."""
     from sdc_taichi.control.registry import controller_names
 
     return ("".join(name.partition(":")[:2]) for name in controller_names())
 
 
 def complete_sites(incomplete: str) -> list[str]:
-    """Completion of the last site in a list separated by commas."""
+    """Return completions of the last site in a list of sites separated by commas."""
     from sdc_taichi.exogenous.registry import site_names
 
     before, comma, _ = incomplete.rpartition(",")
@@ -159,7 +162,10 @@ Start = Annotated[str | None, typer.Option(metavar="MM-DD", help="First day, loc
 
 
 def controllers_option(help: str) -> Any:
-    """Option ``--controller`` of a command, which may be repeated or not."""
+    """Return the option ``--controller`` of a command.
+
+    The type of the parameter determines whether the option can be repeated.
+    """
     return typer.Option(metavar="NAME", help=help, autocompletion=complete_controllers)
 
 
@@ -176,39 +182,39 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")
 
 
 def out_option(help: str, metavar: str | None = None) -> Any:
-    """Option ``--out`` of a command that writes a file or a folder."""
+    """Return the option ``--out`` of a command that writes a file or a folder."""
     return typer.Option("--out", metavar=metavar, help=help)
 
 
 def force_option(help: str = "Replace an existing file.") -> Any:
-    """Option ``--force`` of a command that replaces nothing without it."""
+    """Return the option ``--force``, without which a command replaces no files."""
     return typer.Option("--force", help=help)
 
 
 def json_option(help: str) -> Any:
-    """Option ``--json`` of a command that prints JSON in place of text."""
+    """Return the option ``--json``, with which a command prints JSON instead of text."""
     return typer.Option("--json", help=help)
 
 
 @dataclass(frozen=True)
 class ConfigOptions:
-    """The configuration of a command."""
+    """Options for the configuration of a data center."""
 
     source: Source = None
     overrides: Overrides = None
 
     def read(self) -> tuple[DataCenterConfig, str]:
-        """The configuration, and the name of its preset or file.
+        """Return the configuration, and the name of its preset or file.
 
         Raises:
-            ConfigError: two presets or files, or a configuration that is not valid.
+            ConfigError: there are two presets or files, or the configuration is not valid.
         """
         return read_config(self.source, self.overrides)
 
 
 @dataclass(frozen=True)
 class SiteOptions:
-    """Sites, and files with their inputs."""
+    """Options for sites, and for files of weather, carbon intensity and workload."""
 
     site: Site = None
     weather: Annotated[
@@ -233,17 +239,17 @@ class SiteOptions:
         sample: Path | None = None,
         seed: int = 0,
     ) -> list[DataCenterConfig]:
-        """Configurations of the data centers at the sites.
+        """Return the configurations of the data centers at the sites.
 
         Args:
-            base: configuration that all of them are made from.
-            start: first day, of ``--start``.
-            dcs: number of ``--dcs``; None is one per site.
-            sample: file of ``--sample``.
-            seed: seed of ``--sample``.
+            base: configuration from which those of the data centers are derived.
+            start: first day of the run (``--start``); None is that of ``base``.
+            dcs: number of data centers (``--dcs``); None is one per site.
+            sample: file with fields to sample (``--sample``); None samples nothing.
+            seed: seed of the sampled fields.
 
         Raises:
-            ConfigError: an option that is not valid, or does not fit the others.
+            ConfigError: an option is not valid, or contradicts another option.
         """
         from sdc_taichi.sim.fleet_configs import make_configs
 
@@ -254,7 +260,8 @@ class SiteOptions:
             except ValueError as error:
                 raise ConfigError(f"--start: {error}") from None
             base = _with_site(base, start=start.strip())
-        # Without --site the files are those of the one data center; with it each site has its own.
+        # Without --site, all data centers use the files given; with it, each site has its own
+        # files, which are set below.
         base = _with_site(base, **{field: None if sites else of[0] for field, of in files.items()})
         rules = None if sample is None else _read_sample(sample)
         try:
@@ -269,7 +276,10 @@ class SiteOptions:
         ]
 
     def _files(self) -> dict[str, list[str]]:
-        """Files by their field of section ``site``: one per site, or one for all sites."""
+        """Return the paths of input files, keyed by their field of section ``site``.
+
+        Each field has one path per site, or a single path for all sites.
+        """
         count = max(len(site_names(self.site)), 1)
         files = {}
         for option in ("weather", "carbon", "workload"):
@@ -288,7 +298,7 @@ class SiteOptions:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Random numbers and precision of runs."""
+    """Options for the seed and the numerical precision of runs."""
 
     seed: Annotated[
         int,
@@ -306,7 +316,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class ForecastRunOptions(RunOptions):
-    """Random numbers, precision, and errors of forecasts of runs."""
+    """Options for the seed, the numerical precision, and forecast errors of runs."""
 
     forecast_error: Annotated[
         str | None,
@@ -318,7 +328,7 @@ class ForecastRunOptions(RunOptions):
     ] = None
 
     def error(self) -> ForecastError:
-        """Errors of the forecasts that controllers get.
+        """Return the errors of the forecasts that controllers receive.
 
         Raises:
             ConfigError: the text of the option is not valid.
@@ -329,16 +339,16 @@ class ForecastRunOptions(RunOptions):
 
 
 def check_out_file(out: Path | None, suffix: str, *, force: bool, option: str = "--out") -> None:
-    """Check the file of an option such as ``--out`` before any work; None is no file.
+    """Check the output file of an option such as ``--out``; call this before any long work.
 
     Args:
-        out: the file.
+        out: path of the file; None without the option, which is valid.
         suffix: the only valid suffix, such as ``.png``.
-        force: whether an existing file may be replaced.
-        option: the option, for messages.
+        force: True if an existing file may be replaced.
+        option: name of the option, for messages.
 
     Raises:
-        ConfigError: another suffix, a folder, or an existing file without ``force``.
+        ConfigError: the path has another suffix, is a folder, or exists and ``force`` is False.
     """
     if out is None:
         return
@@ -351,10 +361,10 @@ def check_out_file(out: Path | None, suffix: str, *, force: bool, option: str = 
 
 
 def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:
-    """The preset or file that ``Source`` names, None if it names none, and its overrides.
+    """Split the words of ``Source`` into the preset or file (None without one) and overrides.
 
     Raises:
-        ConfigError: two presets or files.
+        ConfigError: there are two presets or files.
     """
     words = source or []
     files = [text for text in words if "=" not in text or os.path.isfile(text)]
@@ -369,10 +379,10 @@ def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:
 def read_config(
     source: list[str] | None, overrides: list[str] | None = None
 ) -> tuple[DataCenterConfig, str]:
-    """The configuration of ``Source`` and ``Overrides``, and the name of its preset or file.
+    """Return the configuration of ``Source`` and ``Overrides``, and the name of its preset or file.
 
     Raises:
-        ConfigError: two presets or files, or a config that is not valid.
+        ConfigError: there are two presets or files, or the configuration is not valid.
     """
     preset, assigned = parse_source(source)
     name = preset or "corrected"
@@ -380,10 +390,10 @@ def read_config(
 
 
 def site_names(site: str | None) -> list[str]:
-    """Names of ``--site``; none without it.
+    """Return the site names in the value of ``--site``; an absent option gives an empty list.
 
     Raises:
-        ConfigError: an empty name, or one that is given twice.
+        ConfigError: a name is empty, or occurs twice.
     """
     if site is None:
         return []

@@ -1,4 +1,4 @@
-"""``sdc-taichi policy``: show a policy, or export it for other programs."""
+"""``sdc-taichi policy``: describe a policy, or export it as an ONNX model."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def export_policy(
 
 
 def _origin(policy: Policy) -> str:
-    """Algorithm, steps, seed and version of a policy as one line of text."""
+    """Return algorithm, steps, seed and version of a policy as one line of text."""
     about = policy.about
     parts = [about.algorithm, f"{about.steps:,} steps"]
     parts += [] if about.seed is None else [f"seed {about.seed}"]
@@ -62,12 +62,12 @@ def _origin(policy: Policy) -> str:
 
 
 def _facts(policy: Policy) -> list[tuple[str, str]]:
-    """Interface and networks of a policy as pairs of a label and a text."""
+    """Return facts about interface and networks of a policy, as pairs of label and text."""
     fits = policy.interface
     order = "" if fits.action_order is None else f", order {fits.action_order}"
     facts = [("others", policy.about.others), ("actions", f"{fits.actions}{order}")]
-    held = policy.decision_steps
-    facts += [("decides", "in every step" if held == 1 else f"every {held} steps")]
+    interval = policy.decision_steps
+    facts += [("decides", "in every step" if interval == 1 else f"every {interval} steps")]
     facts += [("step", f"{fits.step_min} min"), ("observations", fits.observations)]
     for label, number in (("CRAC units", fits.crac_units), ("racks", fits.racks)):
         facts += [] if number is None else [(label, str(number))]

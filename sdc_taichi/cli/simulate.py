@@ -38,12 +38,12 @@ if TYPE_CHECKING:
     from sdc_taichi.viz.recorder import Recorder
 
 MAX_DCS = 100_000
-"""Largest number of data centers of ``--dcs``."""
+"""Largest valid number of data centers in ``--dcs``."""
 
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """The Rerun recording of a run, in a file or for viewers that watch it."""
+    """Options for the Rerun recording of a run, in a file or for viewers during the run."""
 
     record: Annotated[
         str | None,
@@ -75,10 +75,11 @@ class RecordingOptions:
     ] = None
 
     def recorder(self) -> Recorder | None:
-        """The recorder that the options ask for; None if they ask for no recording.
+        """Create the recorder for the options; return None if no recording is requested.
 
         Raises:
-            SdcError: options of a recording without one, or a recording that cannot be made.
+            SdcError: options for recordings are given without a recording, or the recording cannot
+                be created.
         """
         from sdc_taichi.viz.recording_output import DEFAULT_PORT, is_address
 
@@ -96,7 +97,7 @@ class RecordingOptions:
 
         target = self.record
         if target is not None and target.endswith(".rrd") and not is_address(target):
-            with contextlib.suppress(OSError):  # the recorder says what is wrong with it
+            with contextlib.suppress(OSError):  # the recorder reports the error
                 Path(target).parent.mkdir(parents=True, exist_ok=True)
         names = None if self.focus is None else [name.strip() for name in self.focus.split(",")]
         return Recorder(target, focus=names, every=self.every, serve_port=port)
@@ -217,7 +218,7 @@ def simulate_command(
 
 
 def _default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
-    """Folder of a run without ``--out``, named after preset, sites and first day."""
+    """Return the run folder for a run without ``--out``, named by preset, sites and first day."""
     from sdc_taichi.sim.fleet_configs import place_names
 
     sites = list(dict.fromkeys(place_names(configs)))
@@ -234,7 +235,7 @@ def _recorded(
     Args:
         recorder: the recorder; None records nothing.
         sim: the simulator, before its first step.
-        request: the run.
+        request: controller, length and seed of the run.
 
     Yields:
         A function to call with the result of every step.
@@ -253,14 +254,14 @@ def _recorded(
 
 
 def _print_recording(recorder: Recorder | None) -> None:
-    """Print the file of the recording of a run, if there is one."""
+    """Print the path of the recording file of a run, if there is one."""
     if recorder is not None and recorder.file is not None and not recorder.failed:
         file = printable(recorder.file)
         print(f"Recording: {file} (open with: sdc-taichi view {file})")
 
 
 def _serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
-    """Serve a finished run to viewers until Ctrl-C, if it is served at all."""
+    """Serve the recording of a finished run until Ctrl-C; without ``--serve`` do nothing."""
     if recorder is None or recorder.served_address is None or recorder.failed:
         return
     recorder.flush()

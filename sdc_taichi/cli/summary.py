@@ -1,4 +1,4 @@
-"""The summary of a run: a few figures per data center, in the terminal."""
+"""Summary of a run that ``sdc-taichi simulate`` prints: a few figures per data center."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sdc_taichi.cli.terminal import (
 )
 
 NUMBER_FORMAT = "z.4g"
-"""Format of figures below 1000."""
+"""Format specification of figures below 1000."""
 MOST_LINES = 12
-"""Largest number of sources, and of remarks on the optimum, that are printed."""
+"""Largest number of printed sources of inputs, and of printed remarks on the optimum."""
 EVENT_LINES = 8
-"""Number of events up to which each is listed."""
+"""Largest number of printed events."""
 
 _ROWS = (
     ("IT energy (kWh)", "it_kwh"),
@@ -104,14 +104,14 @@ def _hottest_line(metrics: dict[str, Any]) -> str:
 def _optimum_lines(metrics: dict[str, Any]) -> list[str]:
     from sdc_taichi.run.optimum_folder import remarks_beside
 
-    total, of = metrics["total"], metrics["optimum"]
+    total, optimum = metrics["total"], metrics["optimum"]
     names = ("idle_figure", "bound_figure", "achieved_figure")
     idle, bound, achieved = (figure_text(total[name], NUMBER_FORMAT) for name in names)
     share = total["achievable_share"]
     reached = "-" if share is None else f"{100 * share:z.1f} %"
     return [
-        f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
-        f" bound {bound} {of['unit']}; work and energy left at the end are valued",
+        f"Share of the achievable ({optimum['objective']}): {reached}; idle {idle}, achieved "
+        f"{achieved}, bound {bound} {optimum['unit']}; work and energy left at the end are valued",
         *first_lines(remarks_beside(metrics), MOST_LINES, ", see metrics.json"),
     ]
 

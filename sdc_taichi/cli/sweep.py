@@ -1,4 +1,4 @@
-"""``sdc-taichi sweep``: data centers that differ in chosen fields, by month and controller."""
+"""``sdc-taichi sweep``: run all combinations of config values, sites, months and controllers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sdc_taichi.config import DataCenterConfig
 
 _MOST_LINES = 10
-"""Most reasons of failed runs that are printed."""
+"""Largest number of printed reasons for failed runs."""
 
 
 def sweep_command(
@@ -143,7 +143,15 @@ def _sweep(
     most: int,
     **options: Any,
 ) -> Sweep:
-    """The sweep of the options; sites of ``--site`` are values of ``site.location``."""
+    """Create the sweep for the options of the command.
+
+    Args:
+        config: base config of all runs.
+        vary: values of ``--vary``.
+        site: value of ``--site``; its sites are values of the field ``site.location``.
+        most: largest number of runs.
+        options: further arguments of ``Sweep``.
+    """
     from sdc_taichi.benchmark.sweep import Sweep
     from sdc_taichi.benchmark.vary import Grid, parse_vary
 
@@ -161,7 +169,7 @@ def _sweep(
 
 
 def _months(text: str | None) -> tuple[int, ...]:
-    """Months of ``--months``; none without it."""
+    """Parse the value of ``--months``; an absent option gives an empty tuple."""
     if text is None:
         return ()
     if text.strip() == "all":
@@ -179,10 +187,10 @@ def _months(text: str | None) -> tuple[int, ...]:
 
 
 def _with_best(sweep: Sweep, metric: str) -> Sweep:
-    """The sweep, with the value of the configuration added to the candidates.
+    """Return the sweep with the configured value of the varied field added to its values.
 
     Raises:
-        ConfigError: no such metric, or nothing to choose.
+        ConfigError: the metric of ``--best`` is unknown, or there is no field to choose for.
     """
     from sdc_taichi.benchmark.best_value import with_default
     from sdc_taichi.benchmark.sweep import metric_names
@@ -195,7 +203,7 @@ def _with_best(sweep: Sweep, metric: str) -> Sweep:
 
 
 def _shown(sweep: Sweep, label: str, jobs: int) -> str:
-    """Size and settings of a sweep as YAML, which ``--show`` prints."""
+    """Return size and settings of a sweep as YAML, for ``--show``."""
     import yaml
 
     settings = sweep.settings() | {"config": label}
@@ -204,16 +212,16 @@ def _shown(sweep: Sweep, label: str, jobs: int) -> str:
 
 
 def _default_folder(label: str, sweep: Sweep) -> Path:
-    """Folder of a sweep without ``--out``, named after preset and fields."""
+    """Return the folder for a sweep without ``--out``, named by preset and varied fields."""
     fields = [field.rpartition(".")[2] for field in sweep.fields]
     return Path("sweeps") / "-".join([Path(label).stem, *fields])
 
 
 def _print_failures(store: ResultStore) -> tuple[int, int]:
-    """Print why runs failed, each reason once, on stderr.
+    """Print the distinct reasons for failed runs on stderr.
 
     Returns:
-        Number of runs that have rows, and of those that failed in jobs that are done.
+        Number of runs with results, and number of failed runs in finished jobs.
     """
     runs = 0
     reasons: dict[str, list[str]] = {}
@@ -221,8 +229,8 @@ def _print_failures(store: ResultStore) -> tuple[int, int]:
     for result in store.results():
         runs += len(result.values["cells"])
         notes |= dict.fromkeys(result.metrics["notes"])
-        for each in result.metrics["failed"]:
-            reasons.setdefault(each["error"], []).append(each["combination"])
+        for failure in result.metrics["failed"]:
+            reasons.setdefault(failure["error"], []).append(failure["combination"])
     print_notes(notes)
     lines = [
         one_line(f"{' '.join(first_lines(combinations, 1, ''))}: {error}")
@@ -235,7 +243,14 @@ def _print_failures(store: ResultStore) -> tuple[int, int]:
 
 
 def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -> None:
-    """Write and print the best value by month, with its picture where matplotlib is installed."""
+    """Write and print the best value of a field by month, with a picture if matplotlib is there.
+
+    Args:
+        store: folder of the results of the sweep.
+        sweep: the sweep.
+        metric: name of the metric to minimise.
+        quiet: True to print nothing.
+    """
     from sdc_taichi.atomic_file import atomic_write
     from sdc_taichi.benchmark.best_value import (
         best_by_month,
@@ -259,8 +274,8 @@ def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -
         with atomic_write(store.folder / name) as file:
             file.write(text.encode())
     names = [*texts, "best.png"]
-    held = value_at(sweep.config, field)
-    default = held if isinstance(held, int | float) else None
+    configured = value_at(sweep.config, field)
+    default = configured if isinstance(configured, int | float) else None
     panels = [MonthlyFigures(*each) for each in figures_by_month(rows, sweep, metric)]
     try:
         picture = plot_best_values(panels, field, metric, default)

@@ -1,4 +1,4 @@
-"""The terminal of a command: exit codes, tables, notes, warnings, Ctrl-C and progress."""
+"""Terminal functions of commands: exit codes, tables, notes, warnings, Ctrl-C and progress."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
     from sdc_taichi.types import StepResult
 
 EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-"""Exit codes: failure, invalid input, and interruption by Ctrl-C."""
+"""Exit codes of the program for failure, invalid input, and interruption by Ctrl-C."""
 MOST_COLUMNS = 12
-"""Largest number of data centers that have a column each in a table."""
+"""Largest number of data centers with one column each in a table."""
 SECONDS_BETWEEN_LINES = 30.0
-"""Least time between two lines of progress where there is no terminal, in s."""
+"""Smallest time between two lines of progress if stderr is not a terminal, in s."""
 _SECONDS_BETWEEN_BARS = 0.1
 
 
 class PlainConsole(Console):
-    """A console without markup that escapes control characters."""
+    """Rich console that does not interpret markup and escapes control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Escaped text; every string of a line or table passes through here."""
+        """Return a text with control characters escaped; Rich calls this for every string."""
         return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
 
 
 def wide_console(width: int) -> PlainConsole:
-    """A console on standard output, of this width if that is a pipe or a file."""
+    """Return a console for standard output, which has a fixed width if that is not a terminal."""
     return PlainConsole(
         highlight=False, width=None if sys.stdout.isatty() else width, soft_wrap=True
     )
 
 
 def print_table(title: str, table: pd.DataFrame) -> None:
-    """Print a table with a title, the first column to the left and the others to the right."""
+    """Print a table with a title; its first column is left-aligned, the others right-aligned."""
     from sdc_taichi.learning.evaluation_table import text_rows
 
     console = wide_console(240)
@@ -74,21 +74,21 @@ def figures_table(
     total: Sequence[float | None],
     number_format: str,
 ) -> Table:
-    """Table of the figures of data centers, and of all of them together.
+    """Return a table with the figures of each data center, and of all data centers together.
 
-    Each data center has a column where these fit on the console. Otherwise there are columns for
-    the lowest, mean and highest value.
+    Each data center has a column if the table fits on the console. Otherwise the columns show
+    minimum, mean and maximum over the data centers.
 
     Args:
-        console: where the table is to be printed.
+        console: console on which the table will be printed.
         titles: titles of the rows.
         names: names of the data centers.
         columns: values of the rows for each data center; None is an unknown value.
         total: values of the rows for all data centers together.
-        number_format: format of values below 1000.
+        number_format: format specification of values below 1000.
     """
 
-    def made(heads: Sequence[str], values: Sequence[Sequence[float | None]]) -> Table:
+    def make_table(heads: Sequence[str], values: Sequence[Sequence[float | None]]) -> Table:
         table = Table("")
         for head in heads:
             table.add_column(head, justify="right", no_wrap=True)
@@ -96,38 +96,40 @@ def figures_table(
             table.add_row(title, *(figure_text(value, number_format) for value in row))
         return table
 
-    table = made([*names, "all"], [*columns, total]) if len(names) > 1 else made(names, columns)
+    is_fleet = len(names) > 1
+    heads = [*names, "all"] if is_fleet else names
+    table = make_table(heads, [*columns, total] if is_fleet else columns)
     if len(names) <= MOST_COLUMNS and console.measure(table).maximum <= console.width:
         return table
     spread = [_spread(row) for row in zip(*columns, strict=True)]
-    return made(["lowest", "mean", "highest", "all"], [*zip(*spread, strict=True), total])
+    return make_table(["lowest", "mean", "highest", "all"], [*zip(*spread, strict=True), total])
 
 
 def _spread(values: Sequence[float | None]) -> tuple[float | None, float | None, float | None]:
-    """Lowest, mean and highest of the known values."""
+    """Return minimum, mean and maximum of the known values; all None without known values."""
     known = [value for value in values if value is not None]
     return (min(known), sum(known) / len(known), max(known)) if known else (None, None, None)
 
 
 def figure_text(value: float | None, number_format: str) -> str:
-    """A figure in a format, or whole with separators from 1000 on; a dash if it is unknown."""
+    """Return a figure as text: formatted, an integer with commas from 1000 on, a dash for None."""
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 1000 else format(value, number_format)
 
 
 def count_text(number: float, noun: str) -> str:
-    """A number and a noun, in the plural where that is due."""
+    """Return a number and a noun, with a plural "s" unless the number is 1."""
     return f"{number:,.10g} {noun}" + ("" if number == 1 else "s")
 
 
 def first_lines(lines: Sequence[str], most: int, rest: str) -> list[str]:
-    """The first of many lines, and a line that counts the others.
+    """Return the first lines, and a line with the number of further ones.
 
     Args:
-        lines: the lines.
-        most: largest number of lines that are shown.
-        rest: where the other lines are, or what they are.
+        lines: all lines.
+        most: largest number of lines to return unchanged.
+        rest: text after the number of further lines, such as ``, see metrics.json``.
     """
     more = len(lines) - most
     return [*lines[:most], f"and {more} more{rest}"] if more > 0 else [*lines]
@@ -167,10 +169,10 @@ def warnings_in_lines() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM; a second one ends the program at once.
+    """Catch the first Ctrl-C or SIGTERM; a second one raises ``KeyboardInterrupt``.
 
     Yields:
-        A function that says whether the run is to end.
+        A function that returns True after the first signal, so that the run can end in order.
     """
     signals: list[int] = []
 
@@ -189,10 +191,10 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def exit_if_stopped() -> Iterator[None]:
-    """End the command if Ctrl-C or SIGTERM stops the work on an optimum.
+    """End the command with a message if Ctrl-C or SIGTERM stopped the solver of an optimum.
 
     Raises:
-        typer.Exit: the work was stopped; a message says how much of it is stored.
+        typer.Exit: the solver was stopped; a message on stderr says which results are stored.
     """
     from sdc_taichi.optimum import StoppedError
 
@@ -205,11 +207,11 @@ def exit_if_stopped() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], None]]:
-    """Show the progress of a run on stderr, if that is a terminal.
+    """Show the progress of a simulation run on stderr, if that is a terminal.
 
     Args:
         steps: number of steps of the run.
-        shown: whether to show it at all.
+        shown: True to show progress.
 
     Yields:
         A function to call with the result of every step.
@@ -219,25 +221,25 @@ def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], 
 
 
 class StageProgress(Protocol):
-    """Progress callback of a piece of work that has stages."""
+    """Progress callback ``(stage, done, total, text)`` of work with several stages."""
 
     def __call__(self, stage: str, done: int, total: int, text: str | None = None) -> None:
-        """Show how much of a stage is done.
+        """Show the progress of a stage.
 
         Args:
             stage: name of the stage.
-            done: how much of it is done.
-            total: how much there is.
+            done: number of finished units of work, such as steps.
+            total: number of all units of work in the stage.
             text: text beside the bar; None is the name of the stage.
         """
 
 
 @contextlib.contextmanager
 def stage_bars(*, shown: bool) -> Iterator[StageProgress]:
-    """Show a progress bar for each stage of a piece of work on stderr, if that is a terminal.
+    """Show a progress bar for each stage of some work on stderr, if that is a terminal.
 
     Args:
-        shown: whether to show them at all.
+        shown: True to show progress bars.
 
     Yields:
         The progress callback.
@@ -263,17 +265,20 @@ def stage_bars(*, shown: bool) -> Iterator[StageProgress]:
 
 
 class ProgressLines:
-    """Progress as lines on stderr where there is no terminal: one every half a minute."""
+    """Printer of progress lines on stderr, at most one per ``SECONDS_BETWEEN_LINES``.
+
+    Commands use it if stderr is not a terminal.
+    """
 
     def __init__(self) -> None:
         self._printed_s = -math.inf
 
     def print(self, text: str, *, always: bool) -> None:
-        """Print a line if the last one is old enough.
+        """Print a line unless the previous line was printed a short time ago.
 
         Args:
             text: the line.
-            always: print it in any case.
+            always: True to print the line in any case.
         """
         now_s = time.monotonic()
         if always or now_s - self._printed_s >= SECONDS_BETWEEN_LINES:
@@ -282,7 +287,7 @@ class ProgressLines:
 
 
 def _rich_progress() -> Progress:
-    """Progress bars on stderr that disappear when they are done."""
+    """Create progress bars on stderr, which disappear at the end."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -297,7 +302,7 @@ def _rich_progress() -> Progress:
 
 
 def duration(seconds: float) -> str:
-    """A length of time as minutes and seconds, and hours from one on."""
+    """Return a duration in s as text, ``M:SS`` or from one hour on ``H:MM:SS``."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

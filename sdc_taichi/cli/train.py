@@ -146,7 +146,17 @@ def _settings(
     file: Path | None,
     resumed: Path | None,
 ) -> TrainingSettings:
-    """Settings of a file or of the training that is resumed, with changes on top."""
+    """Return the settings of a training.
+
+    They are merged in this order: resumed training, file, ``changes``, config and ``--set``.
+
+    Args:
+        changes: settings from options of the command.
+        source: preset or file of the data center, and overrides of its fields.
+        assigned: values of ``--set``.
+        file: YAML file of ``--settings``; None without it.
+        resumed: folder of the resumed training; None for a new training.
+    """
     from sdc_taichi.config import apply_override
     from sdc_taichi.learning.training_folder import settings_of
     from sdc_taichi.learning.training_settings import (
@@ -176,7 +186,7 @@ def _settings(
 
 
 def _agents(text: str) -> list[str]:
-    """Agents by the names of their commands, or by their own names."""
+    """Parse a list of agents, each named by its command (such as ``load``) or its own name."""
     from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
     by_name = {d.command: agent for agent, d in AGENT_DEFINITIONS.items()}
@@ -194,10 +204,10 @@ def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
     """Show the progress of a training on stderr: bars in a terminal, lines elsewhere.
 
     Args:
-        shown: whether to show it at all.
+        shown: True to show progress.
 
     Yields:
-        Arguments ``on_update`` and ``on_stage`` of ``train``.
+        Keyword arguments ``on_update`` and ``on_stage`` for ``train``.
     """
     if not shown:
         yield {}
@@ -222,7 +232,7 @@ def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
 
 
 def _line(now: Progress) -> str:
-    """Steps done, speed, time left, returns and the validation of an update, as text."""
+    """Return steps, speed, remaining time, returns and validation of an update as one line."""
     parts = [f"{now.steps:,} steps, {now.steps_per_s:,.0f}/s, {duration(now.left_s)} left"]
     returns = {n.partition("/")[2]: x for n, x in now.numbers.items() if n.startswith("return/")}
     if returns:
@@ -233,7 +243,7 @@ def _line(now: Progress) -> str:
 
 
 def _validation_text(validation: Validation) -> str:
-    """Figure, share of the achievable and broken constraints of a validation, as text."""
+    """Return change against idle, share of the achievable and broken constraints as text."""
     change = f"{validation.change_pct:+.2f} % against idle"
     share = (
         f", {100.0 * validation.share:.1f} % of the achievable"
@@ -247,7 +257,7 @@ def _validation_text(validation: Validation) -> str:
 
 
 def _print_summary(done: Training) -> None:
-    """Print the steps of a training, its best policy, and how to use it."""
+    """Print steps and duration of a training, its best policy, and how to use the policy."""
     speed = f"{done.steps:,} steps in {done.updates:,} updates, {duration(done.seconds)}"
     print(f"{speed}; files in {printable(done.folder)}")
     if done.best is not None:

@@ -1,4 +1,4 @@
-"""``sdc-taichi report`` and ``view``: a run as one HTML file, and its recording in a viewer."""
+"""``sdc-taichi report`` and ``view``: write the HTML report of a run, and show its recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sdc_taichi.errors import ConfigError, SdcError, printable
 from sdc_taichi.user_file import open_input
 
 WEB_PORT = 9090
-"""Port of the page that ``--web`` serves, if it is free."""
+"""Preferred port of the page that ``--web`` serves; if it is in use, another port is taken."""
 _RECORDING_MAGIC = b"RRF"
 _STOP_WAIT_S = 5.0
 
@@ -104,10 +104,10 @@ def view_command(
 
 
 def check_recording(path: Path) -> None:
-    """Make sure that a file is a recording.
+    """Check that a file is a Rerun recording.
 
     Raises:
-        SdcError: it cannot be read, or is none.
+        SdcError: the file cannot be read, or is not a Rerun recording.
     """
     with open_input(path) as file:
         beginning = file.read(len(_RECORDING_MAGIC))
@@ -116,15 +116,15 @@ def check_recording(path: Path) -> None:
 
 
 def viewer_command(recording: str, *, web: bool, port: int | None) -> tuple[list[str], str | None]:
-    """Command line of the viewer, and the page it serves, if it does.
+    """Return the command line of the viewer, and the URL of the page it serves (None without one).
 
     Args:
-        recording: file or address.
-        web: whether to serve it to browsers.
-        port: of the page; 0 is any free one, None the usual one if that is free.
+        recording: path of a recording, or address of a running recording.
+        web: True to serve the viewer to browsers.
+        port: port of the page; 0 is any free port, None is ``WEB_PORT`` if free or any free port.
 
     Raises:
-        SdcError: rerun-sdk is missing, or the port is taken.
+        SdcError: rerun-sdk is missing, or the port is in use.
     """
     from sdc_taichi.viz.recording_output import HOST, check_port, is_address, served_at
 
@@ -150,7 +150,9 @@ def _page_port() -> int:
 
 
 def viewer_program() -> Path:
-    """Binary of the viewer. Rerun's ``rerun`` script would leave it running when it is ended.
+    """Return the path of the viewer's binary.
+
+    The ``rerun`` script is not used, because ending the script leaves the viewer running.
 
     Raises:
         SdcError: rerun-sdk is missing.
@@ -176,7 +178,7 @@ def viewer_program() -> Path:
 
 
 def _run_viewer(command: list[str]) -> int:
-    """Exit code of the viewer; 0 when it was ended with Ctrl-C or SIGTERM."""
+    """Run the viewer, and return its exit code; 0 if Ctrl-C or SIGTERM ended it."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     environment = {"RERUN_ANALYTICS": "0", "RUST_LOG": "error", **os.environ}
     try:
