@@ -1,8 +1,12 @@
-"""Search for linear policies by the cross-entropy method, which needs no gradient.
+"""Search for linear policies by the cross-entropy method, which needs no gradients.
 
-Parameters of candidates are drawn from normal distributions, which are then fitted to the best of
-them (Rubinstein, Kroese 2004), with a noise that keeps them from narrowing too early and fades over
-the search (Szita, Lorincz 2006).
+In each update, parameters of candidate policies are drawn from normal distributions, which are then
+fitted to the best candidates (Rubinstein and Kroese 2004). Noise is added to the fitted standard
+deviations to prevent premature convergence, and decreases during the search (Szita and Lorincz
+2006).
+
+In shapes, B is the number of data centers, P the number of candidates, n the number of entries of
+an observation, m the number of scores, and k the number of actions.
 """
 
 from __future__ import annotations
@@ -22,37 +26,38 @@ from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.types import F32, F64, I64
 
 LEAST_SPREAD = 1e-9
-"""Smallest spread of the returns of a data center relative to their size."""
+"""Lower bound of the standard deviation of a data center's returns, relative to their size."""
 
 
 @dataclass(slots=True)
 class _Search:
-    """Search for the policy of one learner: n entries are observed, m scores are made of them."""
+    """State of the search for one learner's linear policy, from n observations to m scores."""
 
     mean: F64
-    """Mean of the parameters, (m, n + 1), the last column being the biases."""
+    """Mean of the policy parameters, (m, n + 1); the last column holds the biases."""
     std: F64
-    """Standard deviation of the parameters, (m, n + 1)."""
+    """Standard deviation of the policy parameters, (m, n + 1)."""
     seen_mean: F64
-    """Mean of observations, (n,)."""
+    """Mean of the observations, (n,)."""
     seen_std: F64
-    """Standard deviation of observations, (n,)."""
+    """Standard deviation of the observations, (n,)."""
     usual: F64
-    """Usual return of each data center, a moving average, (B,)."""
+    """Moving average of each data center's returns, (B,)."""
     spread: F64
-    """Mean square of the differences between returns and the usual one, (B,)."""
+    """Moving mean square deviation of each data center's returns from ``usual``, (B,)."""
 
 
 class CrossEntropySearch:
-    """Cross-entropy search; in an update each data center tries a candidate for an episode.
+    """Cross-entropy search; in each update, each data center runs a candidate for one episode.
 
-    Data centers differ more than candidates do. A candidate is therefore judged not by its return,
-    but by how far that exceeds the earlier returns of its data center, in standard deviations.
+    Returns differ more between data centers than between candidates. A candidate is therefore
+    scored by the difference of its return from the average of its data center's earlier returns,
+    divided by their standard deviation.
 
     Args:
         settings: settings of the algorithm.
         stream: the environments to learn in.
-        updates: number of updates of the whole training.
+        updates: total number of updates of the training.
         seed: seed of all random numbers.
 
     Raises:
@@ -89,7 +94,7 @@ class CrossEntropySearch:
             )
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Try candidates for an episode, and fit the distributions to the best of them.
+        """Run candidates for an episode, and fit the distributions to the best of them.
 
         The first update only measures observations and returns.
 
@@ -97,8 +102,8 @@ class CrossEntropySearch:
             stream: the environments, at the beginning of an episode.
 
         Returns:
-            Numbers to log: ``reward/NAME``, the mean over steps; ``spread/NAME``, the mean standard
-            deviation of parameters.
+            Values to log: ``reward/NAME``, the mean reward per step; ``spread/NAME``, the mean
+            standard deviation of the policy parameters.
         """
         drawn = {name: self._draw(search) for name, search in self._searches.items()}
         tried = {name: self._shuffled() for name in self._searches}
@@ -108,25 +113,25 @@ class CrossEntropySearch:
         for name, search in self._searches.items():
             if self._done > 1:
                 figures = _figures(returns[name], search)
-                of_each = np.bincount(tried[name], figures) / np.bincount(tried[name])
-                self._select(search, drawn[name], of_each)
+                mean_figures = np.bincount(tried[name], figures) / np.bincount(tried[name])
+                self._select(search, drawn[name], mean_figures)
             self._remember(search, returns[name])
             logged[f"reward/{name}"] = float(returns[name].mean()) / stream.episode_steps
             logged[f"spread/{name}"] = float(search.std.mean())
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """The policies at the means of the distributions."""
+        """Return the policies whose parameters are the means of the distributions."""
         networks = []
-        for name, of in self._spaces.items():
+        for name, sizes in self._spaces.items():
             search = self._searches[name]
             layers = ((_f32(search.mean[:, :-1]), _f32(search.mean[:, -1])),)
-            seen = _f32(search.seen_mean), _f32(search.seen_std)
-            networks.append(policy_network(layers, *seen, of))
+            moments = _f32(search.seen_mean), _f32(search.seen_std)
+            networks.append(policy_network(layers, *moments, sizes))
         return tuple(networks)
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state, from which the training continues to the same bits."""
+        """Return the complete state, from which a training continues with identical results."""
         fields = _Search.__dataclass_fields__
         return {
             "done": self._done,
@@ -138,7 +143,7 @@ class CrossEntropySearch:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
+        """Restore a state from ``state_dict`` of an algorithm with the same arguments."""
         self._done = int(values["done"])
         self._generator.bit_generator.state = values["generator"]
         for name, of in values["learners"].items():
@@ -146,19 +151,22 @@ class CrossEntropySearch:
             self._searches[name] = _Search(**arrays)
 
     def _draw(self, search: _Search) -> F64:
-        """Parameters of candidates, (P, m, n + 1)."""
+        """Draw the parameters of candidates, (P, m, n + 1)."""
         noise = self._generator.standard_normal((self._settings.candidates, *search.mean.shape))
         return search.mean + search.std * noise
 
     def _shuffled(self) -> I64:
-        """Candidate that each data center tries, (B,)."""
+        """Return the index of the candidate that each data center runs, in random order, (B,)."""
         order = self._generator.permutation(self._size)
         return np.asarray(order % self._settings.candidates, dtype=np.int64)
 
     def _try(
         self, stream: EnvironmentStream, drawn: Mapping[str, F64], tried: Mapping[str, I64]
     ) -> dict[str, F64]:
-        """Returns of an episode by learner, (B,) each; the first measures observations as well."""
+        """Run an episode and return the returns by learner, (B,) each.
+
+        The first episode also measures mean and standard deviation of the observations.
+        """
         parameters = {name: drawn[name][tried[name]].astype(np.float32) for name in drawn}
         returns = {name: np.zeros(self._size) for name in drawn}
         sums = {name: np.zeros((2, s.seen_mean.size)) for name, s in self._searches.items()}
@@ -167,10 +175,10 @@ class CrossEntropySearch:
             count += self._size
             actions = {}
             for name, search in self._searches.items():
-                seen = stream.observations[name].numpy()
+                rows = stream.observations[name].numpy()
                 if not self._done:
-                    sums[name] += seen.sum(0, np.float64), np.square(seen, dtype=np.float64).sum(0)
-                scores = _scores(parameters[name], seen, search)
+                    sums[name] += rows.sum(0, np.float64), np.square(rows, dtype=np.float64).sum(0)
+                scores = _scores(parameters[name], rows, search)
                 actions[name] = torch.from_numpy(_actions(scores, self._spaces[name].choices))
             after = stream.step(actions)
             ended = after.ended
@@ -184,16 +192,16 @@ class CrossEntropySearch:
         return returns
 
     def _select(self, search: _Search, drawn: F64, figures: F64) -> None:
-        """Fit the distributions to the best candidates, and add noise that keeps them wide."""
+        """Fit the distributions to the best candidates, and widen them by the current noise."""
         s = self._settings
         best = np.argsort(-figures, kind="stable")[: max(round(s.elite_share * len(figures)), 1)]
-        left = max(1.0 - (self._done - 1) / max(self._updates - 1, 1), 0.0)
-        noise = s.noise_std * left
+        remaining_share = max(1.0 - (self._done - 1) / max(self._updates - 1, 1), 0.0)
+        noise = s.noise_std * remaining_share
         search.mean = drawn[best].mean(0)
         search.std = np.sqrt(drawn[best].var(0) + noise * noise)
 
     def _remember(self, search: _Search, returns: F64) -> None:
-        """Update the usual return of each data center, and its spread, by an episode."""
+        """Update the moving averages of each data center's returns and their deviations."""
         rate = 1.0 if self._done == 1 else self._settings.memory_rate
         departure = returns - search.usual
         search.usual = search.usual + rate * departure
@@ -203,24 +211,24 @@ class CrossEntropySearch:
 
 
 def _figures(returns: F64, search: _Search) -> F64:
-    """Returns less the usual one of their data center, in its standard deviations, (B,)."""
+    """Return the deviation of each return from its data center's average, standardised, (B,)."""
     departure = returns - search.usual
     spread = np.sqrt(search.spread)
-    # In the second update the spread of a data center is unknown; use that of all.
+    # In the second update, the standard deviation of a single data center is still unknown.
     spread = np.where(spread > 0, spread, np.sqrt(np.mean(departure * departure)))
     least = LEAST_SPREAD * np.maximum(np.abs(search.usual), 1.0)
     return np.asarray(departure / np.maximum(spread, least))
 
 
-def _scores(parameters: F32, seen: F32, search: _Search) -> F32:
-    """Scores of each data center by the candidate that it tries, (B, m)."""
-    scaled = ((seen - search.seen_mean) / search.seen_std).clip(-CLIP, CLIP).astype(np.float32)
+def _scores(parameters: F32, inputs: F32, search: _Search) -> F32:
+    """Return the scores of the candidate that each data center runs, (B, m)."""
+    scaled = ((inputs - search.seen_mean) / search.seen_std).clip(-CLIP, CLIP).astype(np.float32)
     product = np.matmul(parameters[:, :, :-1], scaled[:, :, None])[..., 0]
     return np.asarray(product + parameters[:, :, -1])
 
 
 def _actions(scores: F32, choices: int | None) -> F32 | I64:
-    """Actions, (B, k): numbers of choices, or numbers within -1..1."""
+    """Convert scores to actions, (B, k): option indices, or numbers within -1..1."""
     if choices is not None:
         return np.asarray(scores.reshape(len(scores), -1, choices).argmax(2))
     return scores.clip(-1.0, 1.0)

@@ -1,19 +1,22 @@
-"""PPO, IPPO, MAPPO, HAPPO and HAA2C: one update, of which each algorithm is a special case.
+"""The on-policy algorithms PPO, IPPO, MAPPO, HAPPO and HAA2C, as special cases of one update.
 
 All agents act for some steps with fixed policies. Then each learner i maximises, by Adam,
 
-    M_i min(r_i A_i, clip(r_i, 1 - eps, 1 + eps) A_i) + entropy
+    M_i min(r_i A_i, clip(r_i, 1 - eps, 1 + eps) A_i) + c * entropy
 
-where r_i is the probability of an action under the new policy over that under the old, and A_i is
-the generalised advantage (Schulman et al. 2016) by a critic. The algorithms differ in the critic's
-input, in whose reward it learns, in M_i, and in clipping:
+where r_i is the ratio of an action's probability under the new policy to that under the old policy,
+A_i is the generalised advantage estimate (Schulman et al. 2016) from a critic, and c is the weight
+of the entropy. The algorithms differ in the input and the reward of the critic, in M_i, and in
+clipping:
 
-- ``ppo`` (Schulman et al. 2017) has one learner; ``ippo`` (de Witt et al. 2020) several, each with
-  a critic of its own observation and reward. M_i = 1.
-- ``mappo`` (Yu et al. 2022): a critic of the shared state learns the reward of the team. M_i = 1.
-- ``happo`` (Kuba et al. 2022; Zhong et al. 2024): as ``mappo``, but learners are updated one after
-  another in random order, and M_i is the product of the ratios r_j of those already updated.
-- ``haa2c`` (Zhong et al. 2024): as ``happo`` without clipping, in a single pass.
+- ``ppo`` (Schulman et al. 2017) has one learner, and ``ippo`` (de Witt et al. 2020) has several.
+  Each learner has a critic, which takes its observation and learns its reward. M_i is 1.
+- ``mappo`` (Yu et al. 2022) has one critic, which takes the shared state and learns the reward of
+  the team. M_i is 1.
+- ``happo`` (Kuba et al. 2022; Zhong et al. 2024) has the critic of ``mappo``. Learners are updated
+  one after another in random order, and M_i is the product of the ratios r_j of the learners j that
+  are already updated.
+- ``haa2c`` (Zhong et al. 2024) is ``happo`` without clipping, with a single pass over the steps.
 """
 
 from __future__ import annotations
@@ -37,12 +40,12 @@ from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.stream import EnvironmentStream
 
 TEAM = "team"
-"""Name of the critic of the team's reward."""
+"""Name of the critic that learns the reward of the team."""
 ADAM_EPSILON = 1e-5
 
 
 class _Critic(NamedTuple):
-    """A critic, with the moments of its inputs and of the returns that it learns."""
+    """A critic with its optimiser and the running moments of its inputs and returns."""
 
     net: nn.Sequential
     adam: torch.optim.Adam
@@ -51,7 +54,7 @@ class _Critic(NamedTuple):
 
 
 class _Rollout(NamedTuple):
-    """Decisions of all environments under fixed policies, (T, B, ...) each."""
+    """T decisions of B environments under fixed policies; tensors have shape (T, B, ...)."""
 
     observations: dict[str, Tensor]
     next_observations: dict[str, Tensor]
@@ -65,13 +68,13 @@ class _Rollout(NamedTuple):
 
 
 class OnPolicy:
-    """A learner for each policy, updated from steps that the policies have just made.
+    """On-policy algorithm: learners that are updated from the steps of their current policies.
 
     Args:
-        definition: properties in which the algorithm differs from others.
+        definition: properties in which the on-policy algorithms differ.
         settings: settings of the algorithm.
         stream: the environments to learn in.
-        updates: number of updates of the whole training, over which the learning rate falls.
+        updates: total number of updates of the training; sets the schedule of the learning rate.
         seed: seed of weights, actions, order of learners and mini-batches.
     """
 
@@ -102,13 +105,13 @@ class OnPolicy:
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
         """Act for ``rollout_decisions`` decisions, and learn from them.
 
-        The first update only measures mean and variance of what is observed.
+        The first update only measures mean and variance of the observations.
 
         Args:
             stream: the environments.
 
         Returns:
-            Numbers to log: ``reward/NAME``, the mean over steps; losses; entropies.
+            Values to log: ``reward/NAME``, the mean reward per step; losses; entropies.
         """
         rollout = self._collect(stream)
         steps = self._settings.decision_steps
@@ -124,7 +127,7 @@ class OnPolicy:
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """The current policies."""
+        """Return the networks of the current policies."""
         activation = self._settings.activation
         return tuple(
             policy_network(
@@ -138,7 +141,7 @@ class OnPolicy:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state, from which the training continues to the same bits."""
+        """Return the complete state, from which a training continues with identical results."""
         return {
             "done": self._done,
             "generators": {n: g.get_state() for n, g in self._generators.items()},
@@ -157,7 +160,7 @@ class OnPolicy:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` of an algorithm with equal arguments returned."""
+        """Restore a state from ``state_dict`` of an algorithm with the same arguments."""
         self._done = int(values["done"])
         for name, generator in self._generators.items():
             generator.set_state(values["generators"][name])
@@ -172,7 +175,7 @@ class OnPolicy:
     # Acting
 
     def _collect(self, stream: EnvironmentStream) -> _Rollout:
-        """Act with the current policies."""
+        """Act with the current policies for ``rollout_decisions`` decisions."""
         decisions = []
         with torch.no_grad():
             for _ in range(self._settings.rollout_decisions):
@@ -204,7 +207,7 @@ class OnPolicy:
     # Learning
 
     def _learn(self, rollout: _Rollout) -> dict[str, float]:
-        """Learn from a rollout: each critic, then each learner's policy."""
+        """Update each critic and then each policy from a rollout; return the values to log."""
         logged: dict[str, float] = {}
         advantages: dict[str, Tensor] = {}
         for name in self._critics:
@@ -225,10 +228,10 @@ class OnPolicy:
         return logged
 
     def _advantages(self, critic: str, rollout: _Rollout) -> tuple[Tensor, Tensor]:
-        """Normalised advantages and normalised returns, (T * B,) each.
+        """Return normalised advantages and normalised target returns, (T * B,) each.
 
-        An episode that is cut off has the value of the situation after its last step, and nothing
-        of the next episode.
+        At the end of a truncated episode, the critic's value of the final situation stands for the
+        later rewards. Rewards of the next episode are not included.
         """
         s, of = self._settings, self._critics[critic]
         now, after = self._critic_inputs(critic, rollout)
@@ -256,7 +259,10 @@ class OnPolicy:
         return normal, (targets - of.returns.mean.float()) / of.returns.std
 
     def _rescale(self, critic: _Critic, targets: Tensor) -> None:
-        """Add returns to the moments without changing values (Pop-Art, van Hasselt et al. 2016)."""
+        """Update the moments of returns; adapt the critic's last layer so that its values stay.
+
+        The method is Pop-Art (van Hasselt et al. 2016).
+        """
         mean, std = critic.returns.mean.float(), critic.returns.std
         critic.returns.add(targets.unsqueeze(-1))
         last = critic.net[-1]
@@ -267,7 +273,7 @@ class OnPolicy:
             last.bias.mul_(std).add_(mean - new_mean).div_(new_std)
 
     def _learn_values(self, name: str, rollout: _Rollout, targets: Tensor) -> float:
-        """Fit a critic to returns, and return the mean loss."""
+        """Fit a critic to target returns, and return the mean loss."""
         critic = self._critics[name]
         inputs = critic.inputs.normalise(self._critic_inputs(name, rollout)[0].flatten(0, 1))
         total = 0.0
@@ -282,9 +288,9 @@ class OnPolicy:
     def _learn_policy(
         self, name: str, rollout: _Rollout, advantages: Tensor, weight: Tensor | None
     ) -> dict[str, float]:
-        """Improve a policy, and return the mean loss and entropy."""
+        """Update a policy, and return the mean loss and entropy."""
         actor, adam = self._actors[name], self._adams[name]
-        seen = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
+        inputs = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
         actions = rollout.actions[name].flatten(0, 1)
         old_log_p = rollout.log_p[name].flatten()
         weighted = advantages if weight is None else advantages * weight
@@ -292,7 +298,7 @@ class OnPolicy:
         totals = torch.zeros(2)
         batches = self._batches(len(actions))
         for batch in batches:
-            rows = seen.index_select(0, batch), actions.index_select(0, batch)
+            rows = inputs.index_select(0, batch), actions.index_select(0, batch)
             log_p, entropy = actor.evaluate(*rows)
             ratio = (log_p - old_log_p[batch]).exp()
             loss = policy_loss(ratio, weighted[batch], clip)
@@ -302,29 +308,29 @@ class OnPolicy:
         return {f"policy_loss/{name}": loss_mean, f"entropy/{name}": entropy_mean}
 
     def _ratio(self, name: str, rollout: _Rollout) -> Tensor:
-        """Ratio of the new to the old probability of the actions, (T * B,)."""
-        seen = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
+        """Return the ratio of each action's new to old probability, (T * B,)."""
+        inputs = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
         with torch.no_grad():
-            log_p, _ = self._actors[name].evaluate(seen, rollout.actions[name].flatten(0, 1))
+            log_p, _ = self._actors[name].evaluate(inputs, rollout.actions[name].flatten(0, 1))
         return (log_p - rollout.log_p[name].flatten()).exp()
 
     def _critic_inputs(self, critic: str, rollout: _Rollout) -> tuple[Tensor, Tensor]:
-        """Inputs of a critic before and after each step, (T, B, n) each."""
+        """Return the inputs of a critic before and after each decision, (T, B, n) each."""
         if self._definition.critic == "state":
             return rollout.state, rollout.next_state
         return rollout.observations[critic], rollout.next_observations[critic]
 
     def _rewards_of(self, critic: str, rollout: _Rollout) -> Tensor:
-        """Rewards that a critic learns, (T, B)."""
+        """Return the rewards that a critic learns, (T, B)."""
         if self._definition.reward == TEAM:
             return rollout.team
         return rollout.rewards[critic]
 
     def _batches(self, rows: int) -> list[Tensor]:
-        """Rows of each mini-batch of all passes."""
+        """Return the row indices of each mini-batch, over all passes."""
         s = self._settings
         if not self._definition.clips:
-            # Without clipping, the ratios are valid for one gradient step alone.
+            # Without clipping, the collected steps are valid for only one gradient step.
             return [torch.arange(rows)]
         generator = self._generators["batches"]
         orders = [torch.randperm(rows, generator=generator) for _ in range(s.epochs)]
@@ -337,7 +343,7 @@ class OnPolicy:
         adam.step()
 
     def _anneal(self) -> None:
-        """Lower the learning rate, in even steps to 0 over the training."""
+        """Lower the learning rate linearly, from its initial value to 0 during the training."""
         if not self._settings.anneal:
             return
         left = max(1.0 - (self._done - 1) / max(self._updates, 1), 0.0)
@@ -345,7 +351,7 @@ class OnPolicy:
             adam.param_groups[0]["lr"] = self._settings.rate * left
 
     def _make_critics(self, state_width: int) -> dict[str, _Critic]:
-        """A critic for each learner, or one for the team."""
+        """Create a critic for each learner, or a single critic for the team."""
         shared = self._definition.critic == "state"
         names = [TEAM] if self._definition.reward == "team" and shared else list(self._spaces)
         critics = {}
@@ -377,15 +383,15 @@ def generalised_advantages(
     discount: float,
     gae_lambda: float,
 ) -> Tensor:
-    """Generalised advantages of steps (Schulman et al. 2016, eq. 16), (T, B).
+    """Return generalised advantage estimates (Schulman et al. 2016, eq. 16), (T, B).
 
     Args:
         rewards: rewards, (T, B).
         values: values before each step, (T, B).
-        next_values: values after each step, of the same episode, (T, B).
-        ended: 1 where the episodes were cut off after the step, else 0, (T,).
-        discount: weight of a reward one step later.
-        gae_lambda: weight of later steps in the advantage.
+        next_values: values after each step, within the same episode, (T, B).
+        ended: 1 if the episodes were truncated after the step, else 0, (T,).
+        discount: discount factor gamma per step.
+        gae_lambda: parameter lambda of the estimator.
     """
     errors = rewards + discount * next_values - values
     advantages = torch.empty_like(rewards)
@@ -397,12 +403,13 @@ def generalised_advantages(
 
 
 def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor:
-    """Negative of the surrogate objective of a policy (Schulman et al. 2017, eq. 7).
+    """Return the negative surrogate objective of a policy (Schulman et al. 2017, eq. 7).
 
     Args:
-        ratio: probability of each action under the policy over that under the old one, (n,).
+        ratio: ratio of each action's probability under the new policy to that under the old policy,
+            (n,).
         advantages: advantage of each action, (n,).
-        clip: largest change of the ratio that pays; None is any.
+        clip: clipping range of the ratio; None does not clip.
     """
     gain = ratio * advantages
     if clip is not None:
@@ -411,17 +418,17 @@ def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor
 
 
 def value_loss(values: Tensor, targets: Tensor) -> Tensor:
-    """Half the mean squared error of values, (n,)."""
+    """Return half the mean squared error of n values, shape ()."""
     return 0.5 * (values - targets).square().mean()
 
 
 def _stacked(values: Sequence[Any]) -> Any:
-    """Tensors of several decisions as one, (T, ...); in dicts, one for each name."""
+    """Stack the tensors of T decisions, (T, ...); dicts of tensors are stacked by name."""
     if isinstance(values[0], dict):
         return {name: torch.stack([value[name] for value in values]) for name in values[0]}
     return torch.stack(list(values))
 
 
 def _within_space(actions: Tensor) -> Tensor:
-    """Actions of an environment: choices as they are, numbers cut at -1 and 1."""
+    """Clip continuous actions to -1..1; discrete choices are unchanged."""
     return actions if actions.dtype == torch.int64 else actions.clamp(-1.0, 1.0)

@@ -1,7 +1,10 @@
-"""Policies: networks of a training with the interface that they fit, and their files.
+"""Trained policies: networks with the interface of the environments that they fit, and their files.
 
-``policy.safetensors`` holds the networks, and everything else as JSON in its header, so that a
-policy is one file; ``policy.json`` is a readable copy of the header.
+A policy is a single file, ``policy.safetensors``, which holds the networks as arrays and everything
+else as JSON in its header. ``policy.json`` is a readable copy of the header.
+
+In shapes, B is the number of environments or data centers, n the number of entries of an
+observation, and k the number of actions.
 """
 
 from __future__ import annotations
@@ -38,54 +41,56 @@ from sdc_taichi.user_file import decoding, read_bytes
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 """Names of the files of a policy."""
 FOLDERS = ("best", "policy")
-"""Folders of a training that may hold a policy, in order of preference."""
+"""Subfolders of a training that can contain a policy, in order of preference."""
 CHOICES = 3
-"""Number of discrete actions for each number that an agent decides."""
+"""Number of options of a discrete action."""
 MOST_BYTES = 256_000_000
-"""Largest file of a policy, in bytes: 60 million weights."""
+"""Maximum size of a policy file, in bytes (about 60 million weights)."""
 MOST_DECISION_STEPS = 96
-"""Largest number of steps that an action may be held."""
+"""Maximum number of steps from one decision to the next."""
 Activation = Literal["tanh", "relu"]
-"""Function of the units of hidden layers."""
+"""Activation function of hidden layers."""
 SERIAL_PRODUCTS = 2_000_000
-"""Multiplications of a call up to which one thread is faster than several."""
+"""Number of multiplications per call up to which one thread is faster than several."""
 Head = Literal["argmax", "clip", "tanh"]
-"""How actions follow from the outputs of the last layer: ``argmax`` takes the choice of the highest
-score for each number that is decided; ``clip`` cuts outputs at -1 and 1; ``tanh`` takes their
-hyperbolic tangent."""
+"""Function that maps the outputs of the last layer to actions: ``argmax`` takes the option with the
+highest score for each action; ``clip`` clips outputs to -1..1; ``tanh`` takes their hyperbolic
+tangent."""
 _FORMAT = 1
 _HEADER_KEY = "policy"
 
 
 @dataclass(frozen=True)
 class PolicyNetwork:
-    """A perceptron that acts for one agent, or for several at once.
+    """Perceptron that acts for one agent or for several agents together.
 
-    Observations of several agents stand side by side, each feature once; so do their actions.
+    For several agents, the input concatenates their observations, with each shared feature once,
+    and the output concatenates their actions.
 
     Raises:
-        SdcError: shapes that do not fit each other, or numbers that are not finite.
+        SdcError: the shapes of the arrays are inconsistent, or a number is not finite.
     """
 
     agents: tuple[str, ...]
     """Agents that the network acts for, in the order of their actions."""
     mean: F32
-    """Mean of each entry of the observation, which is subtracted from it, (n,)."""
+    """Mean of each entry of the observation, subtracted for normalisation, (n,)."""
     std: F32
-    """Standard deviation that each entry less its mean is divided by, above 0, (n,)."""
+    """Standard deviation of each entry of the observation, the divisor of the normalisation,
+    positive, (n,)."""
     clip: float
-    """Absolute value at which scaled entries are cut."""
+    """Maximum absolute value of a normalised entry; larger values are clipped."""
     layers: tuple[tuple[F32, F32], ...]
     """Weight, (out, in), and bias, (out,), of each layer."""
     activation: Activation
-    """Function of the units of all layers but the last."""
+    """Activation function of all layers except the last."""
     head: Head
-    """How actions follow from the outputs of the last layer."""
+    """Function that maps the outputs of the last layer to actions."""
     choices: int = CHOICES
-    """Number of scores for each number that is decided, with head ``argmax``."""
+    """Number of options, and so of scores, of each action with head ``argmax``."""
 
     def __post_init__(self) -> None:
-        """Check shapes and numbers, and copy the arrays as f32."""
+        """Check shapes and values, and convert the arrays to read-only f32 copies."""
         who = f"network of {', '.join(self.agents)}"
         mean, std = (_numbers(getattr(self, n), f"{who}: {n}", 1) for n in ("mean", "std"))
         if std.shape != mean.shape or not len(mean) or std.min() <= 0.0:
@@ -112,23 +117,24 @@ class PolicyNetwork:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of inputs, then of units of each layer."""
+        """Number of inputs, followed by the number of units of each layer."""
         return (len(self.mean), *(len(bias) for _, bias in self.layers))
 
     @property
     def action_width(self) -> int:
-        """Number of numbers that it decides, k."""
+        """Number k of actions that the network decides."""
         return self.sizes[-1] // self.choices if self.head == "argmax" else self.sizes[-1]
 
     def scores(self, observations: F32) -> F32:
-        """Outputs of the last layer, (B, choices * k) or (B, k), from observations, (B, n).
+        """Return the outputs of the last layer for observations, (B, n).
 
-        A row has the same bits whatever the other rows are.
+        The shape is (B, choices * k) with head ``argmax`` and (B, k) otherwise. Each row is
+        independent of the other rows, to the last bit.
         """
         return self._forward(observations)
 
     def actions(self, observations: F32) -> F32 | I64:
-        """Actions, (B, k): numbers of choices from 0, or numbers within -1..1."""
+        """Return actions for observations, (B, k): option indices, or numbers within -1..1."""
         scores = self.scores(observations)
         if self.head == "argmax":
             return np.asarray(scores.reshape(len(scores), -1, self.choices).argmax(axis=2))
@@ -140,14 +146,14 @@ class PolicyNetwork:
 
 
 class Forward:
-    """The compiled forward pass of a perceptron with scaled inputs.
+    """Compiled forward pass of a perceptron that normalises its inputs.
 
     Args:
-        mean: subtracted from each input, (n,).
-        std: divides each input afterwards, (n,).
-        clip: largest scaled input, of either sign.
+        mean: mean of each input, (n,).
+        std: standard deviation of each input, (n,).
+        clip: maximum absolute value of a normalised input.
         layers: weight, (out, in), and bias, (out,), of each layer.
-        activation: function of the units of all layers but the last.
+        activation: activation function of all layers except the last.
     """
 
     def __init__(
@@ -177,7 +183,7 @@ class Forward:
         )
 
     def __call__(self, inputs: F32) -> F32:
-        """Outputs of each row, (B, outputs), of inputs, (B, n)."""
+        """Return the outputs, (B, outputs), for inputs, (B, n)."""
         size, blocks = len(inputs), -(-len(inputs) // ROWS)
         rows = np.zeros((blocks * ROWS, self._inputs), dtype=np.float32)
         rows[:size] = inputs
@@ -199,12 +205,12 @@ class Forward:
 
 
 def _whole_units(count: int) -> int:
-    """A number of units, rounded up to a multiple of ``UNITS``."""
+    """Round a number of units up to a multiple of ``UNITS``, the block size of the kernel."""
     return -(-count // UNITS) * UNITS
 
 
 def _parameters(weight: F32, bias: F32) -> F32:
-    """Parameters of a layer in the order of the kernel."""
+    """Return weight and bias of a layer, padded with zeros, in the kernel's memory order."""
     outs, ins = weight.shape
     by_unit = np.zeros((_whole_units(outs), 1 + ins), dtype=np.float32)
     by_unit[:outs, 0], by_unit[:outs, 1:] = bias, weight
@@ -215,35 +221,35 @@ class About(Section):
     """Origin of a policy: algorithm, training and version of the package."""
 
     algorithm: str
-    """Name of the algorithm that it was trained with."""
+    """Name of the training algorithm."""
     seed: int | None = None
-    """Seed of the training; None if it had none."""
+    """Seed of the training; None if the training had no seed."""
     steps: int = Field(default=0, ge=0)
-    """Number of steps of environments that it was trained for."""
+    """Number of training steps, summed over all environments."""
     fingerprint: str = ""
     """Fingerprint of the settings and inputs of the training."""
     others: str = "idle"
-    """Controller of the agents that did not learn, by name."""
+    """Name of the controller of the agents that did not learn."""
     version: str = ""
-    """Version of the package that it was trained with."""
+    """Version of this package in the training."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """Networks that act for all agents of an interface.
+    """Trained policy: networks that together act for all agents of an interface.
 
     Raises:
-        SdcError: networks that do not fit the interface.
+        SdcError: the networks do not fit the interface.
     """
 
     networks: tuple[PolicyNetwork, ...]
-    """Networks, of which each agent has one, alone or with others."""
+    """Networks of the policy; each agent belongs to exactly one network."""
     interface: Interface
-    """Everything of an environment that the networks depend on."""
+    """The properties of observations and actions on which the networks depend."""
     about: About
-    """Algorithm, training and version of the package that the policy comes from."""
+    """Origin of the policy: algorithm, training and version of the package."""
     decision_steps: int = 1
-    """Steps between two decisions, in which actions are held."""
+    """Number of steps from one decision to the next; actions are repeated in between."""
 
     def __post_init__(self) -> None:
         """Check that the networks fit the interface."""
@@ -271,7 +277,7 @@ class Policy:
                 )
 
     def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
-        """Actions of each agent, (B, k), from the observations of each agent, (B, n)."""
+        """Return the actions of each agent, (B, k), for the observations of each agent, (B, n)."""
         by_agent: dict[str, F32 | I64] = {}
         for network, entries in zip(self.networks, self.entries, strict=True):
             parts = [observations[agent][:, columns] for agent, columns in entries.items()]
@@ -287,7 +293,7 @@ class Policy:
 
     @cached_property
     def entries(self) -> tuple[dict[str, npt.NDArray[np.int64] | slice], ...]:
-        """For each network, the entries of each agent's observation that it reads side by side."""
+        """Entries of each agent's observation that each network concatenates as its input."""
         features = self.interface.features
         return tuple(
             entries_of_new_features({agent: features[agent] for agent in network.agents})
@@ -295,7 +301,7 @@ class Policy:
         )
 
     def description(self) -> str:
-        """Everything but the arrays, as JSON."""
+        """Return everything except the arrays as JSON text."""
         described = _Description(
             format=_FORMAT,
             about=self.about,
@@ -309,7 +315,7 @@ class Policy:
         return described.model_dump_json(indent=1)
 
     def save(self, folder: Path) -> None:
-        """Write the policy into a folder, replacing a policy that is already there.
+        """Write the policy to a folder; a policy that is already there is replaced.
 
         A concurrent reader gets either the complete old policy or the complete new one.
 
@@ -335,13 +341,14 @@ class Policy:
 
     @classmethod
     def load(cls, folder: Path) -> Policy:
-        """Read the policy of a folder, or of the training in it (the best one if there is one).
+        """Read the policy in a folder.
 
         Args:
-            folder: the folder.
+            folder: folder of a policy, or of a training, which has a best and a last policy; the
+                best policy is preferred.
 
         Raises:
-            SdcError: there is no policy, or its file is damaged or of another kind.
+            SdcError: there is no policy, or its file is damaged or has a different format.
         """
         path = policy_folder(folder) / WEIGHTS
         content = read_bytes(path, MOST_BYTES)
@@ -373,18 +380,18 @@ class Policy:
 
 
 def action_levels(number: int) -> F32:
-    """Levels that continuous actions are chosen from, evenly from -1 to 1, (number,)."""
+    """Return equally spaced levels from -1 to 1 for continuous actions, (number,)."""
     return np.linspace(-1.0, 1.0, number, dtype=np.float32)
 
 
 def policy_folder(folder: Path) -> Path:
-    """The folder with the policy of a training run, or a folder that holds one itself.
+    """Return the folder that contains the policy files.
 
     Args:
-        folder: either of them.
+        folder: folder of a policy, or of a training with a policy in a subfolder.
 
     Raises:
-        SdcError: there is no such folder, or no policy in it.
+        SdcError: the folder does not exist, or contains no policy.
     """
     for candidate in (folder, *(folder / name for name in FOLDERS)):
         if (candidate / WEIGHTS).exists():
@@ -397,7 +404,7 @@ def policy_folder(folder: Path) -> Path:
 
 
 class _NetworkDescription(Section):
-    """Everything of a network but its arrays."""
+    """Description of a network in the policy file: everything except its arrays."""
 
     agents: tuple[str, ...]
     sizes: tuple[int, ...] = Field(min_length=2)
@@ -408,7 +415,7 @@ class _NetworkDescription(Section):
 
 
 class _Description(Section):
-    """Content of policy.json."""
+    """Content of ``policy.json``."""
 
     format: int
     about: About
@@ -418,7 +425,7 @@ class _Description(Section):
 
 
 def _tensors(network: PolicyNetwork) -> dict[str, F32]:
-    """Arrays of a network by name."""
+    """Return the arrays of a network by name."""
     arrays = {"mean": network.mean, "std": network.std}
     for i, (weight, bias) in enumerate(network.layers):
         arrays |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
@@ -426,7 +433,7 @@ def _tensors(network: PolicyNetwork) -> dict[str, F32]:
 
 
 def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any]) -> PolicyNetwork:
-    """A network of its description and arrays, which are taken out of ``tensors``."""
+    """Build a network from its description; its arrays are removed from ``tensors``."""
 
     def take(name: str) -> F32:
         try:
@@ -453,7 +460,7 @@ def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any
 
 
 def _numbers(values: Any, what: str, ndim: int) -> F32:
-    """Read-only f32 copy of an array of finite numbers."""
+    """Return a read-only f32 copy of an array, after checking dimensions and finite values."""
     array = np.asarray(values)
     if array.dtype.kind != "f" or array.ndim != ndim:
         raise SdcError(f"{what} is {array.dtype} {array.shape}; valid is {ndim}-D, of real numbers")

@@ -1,7 +1,7 @@
-"""Training of policies by an algorithm in a stream of environments, and the files it writes.
+"""Training of policies by an algorithm in a stream of environments, with the files of a training.
 
-Each file of the folder is replaced as a whole, and the checkpoint last, so that a complete
-checkpoint exists however the process ends.
+Each file of the folder is replaced atomically, and the checkpoint is replaced last. A complete
+checkpoint therefore exists even if the process is killed.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.solve import Progress as StageProgress
 
 LEAST_DATA_CENTERS = 256
-"""Least number of data centers of a training that does not say how many."""
+"""Minimum number of data centers in a training whose settings leave the number open."""
 LARGEST_LOSS = 1e6
-"""Loss beyond which a training has diverged; losses are of normalised values, and about 1."""
+"""Loss above which a training counts as diverged; values are normalised, so losses are about 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,22 +69,21 @@ class Progress:
     """Progress of a training after an update."""
 
     update: int
-    """Number of updates done."""
+    """Number of updates done so far."""
     updates: int
-    """Number of updates of the whole training."""
+    """Total number of updates of the training."""
     steps: int
-    """Steps of all data centers together that are done."""
+    """Number of steps done so far, summed over all data centers."""
     passed_s: float
-    """Time of this process since its first update began, in s."""
+    """Time since the first update of this process began, in s."""
     steps_per_s: float
-    """Steps of all data centers together per second of this process, validations included, 1/s."""
+    """Speed of this process in steps of all data centers per second, including validations."""
     left_s: float
-    """Expected time until the end, in s."""
+    """Expected time until the end of the training, in s."""
     numbers: dict[str, float]
-    """Numbers of the update by name, such as ``return/agent_ls`` and ``value_loss/agent_ls``."""
+    """Logged values of the update by name, such as ``return/agent_ls``."""
     validation: Validation | None
-    """Result of the policy in the validation weeks after the update; None if it was not run
-    there."""
+    """Result of the policy in the validation weeks; None if this update had no validation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +95,11 @@ class Training:
     updates: int
     """Number of updates done."""
     steps: int
-    """Steps of all data centers together that are done."""
+    """Number of steps done, summed over all data centers."""
     seconds: float
-    """Time that all processes of the training took, in s."""
+    """Total time of all processes of the training, in s."""
     is_whole: bool
-    """Whether all steps are done; false if it was stopped."""
+    """True if all steps are done; False if the training was stopped early."""
     best: Validation | None
     """Result of the best policy in the validation weeks; None without validation."""
 
@@ -119,20 +118,21 @@ def train(
 
     Args:
         settings: settings of the training.
-        out: folder; created if it does not exist.
-        resume: whether to continue the training in the folder, to the same bits as without the
-            interruption. Its settings must equal ``settings``, except that ``steps`` may be larger.
-        cache: whether to read and write optima of the validation weeks in the user's cache, or a
-            folder for them.
+        out: folder of the training; created if it does not exist.
+        resume: True to continue the training in the folder. The result is bit-identical to that of
+            an uninterrupted training. The saved settings must equal ``settings``, except that
+            ``steps`` may be larger.
+        cache: whether to read and write optima of the validation weeks in the user's cache, or the
+            folder to use instead.
         on_update: called after every update.
         on_stage: progress callback ``(stage, done, total)`` of solving for the optima of the
             validation weeks.
-        stop: called before every update; true ends the training, which can be resumed.
+        stop: called before every update; if it returns true, the training ends and can be resumed.
 
     Raises:
-        SdcError: the folder holds other files or a training with other settings, or another
+        SdcError: the folder contains other files or a training with different settings, or another
             process writes to it; settings contradict each other; a file cannot be written; or the
-            training diverges. The last checkpoint and its policies stay.
+            training diverges. The last checkpoint and its policies are preserved.
     """
     path = Path(out)
     with _one_thread(), claimed(path, settings, resume=resume):
@@ -140,7 +140,7 @@ def train(
         try:
             if resume:
                 run.resume()
-            # Only now: invalid settings leave the folder unchanged.
+            # Write the settings after they were checked: invalid ones leave the folder unchanged.
             write_settings(path, settings)
             with run.validation(cache, on_stage, stop) as weeks:
                 run.update_all(weeks, on_update or (lambda _: None), stop or (lambda: False))
@@ -150,7 +150,7 @@ def train(
 
 
 class _Run:
-    """A training under way."""
+    """State of a running training: environments, algorithm, progress and best result."""
 
     def __init__(self, settings: TrainingSettings, folder: Path) -> None:
         self._settings, self._folder = settings, folder
@@ -188,7 +188,7 @@ class _Run:
         self._env.close()
 
     def resume(self) -> None:
-        """Continue from the checkpoint; start anew if the training has not written one."""
+        """Load the checkpoint; without a checkpoint, the training starts from the beginning."""
         path = self._folder / CHECKPOINT_FILE
         if not path.exists():
             return
@@ -218,10 +218,10 @@ class _Run:
         progress: StageProgress | None,
         stop: Callable[[], bool] | None,
     ) -> Iterator[DataCenterWeeks | None]:
-        """Prepared validation weeks; None without validation, or if ``stop`` returned true.
+        """Yield the validation weeks; None without validation, or if ``stop`` returned true.
 
         Raises:
-            SdcError: their optimum cannot be computed.
+            SdcError: the optimum of the validation weeks cannot be computed.
         """
         settings, validation = self._settings, self._settings.validation
         if not validation.steps or self._update == self._updates:
@@ -254,7 +254,7 @@ class _Run:
         on_update: Callable[[Progress], None],
         stop: Callable[[], bool],
     ) -> None:
-        """Make the updates that are left, or those until ``stop`` returns true.
+        """Make the remaining updates; end early if ``stop`` returns true.
 
         Raises:
             SdcError: the training diverges, or a file cannot be written.
@@ -302,7 +302,7 @@ class _Run:
             raise SdcError(f"{error}; {checkpoint}") from None
 
     def _row(self) -> dict[str, Any]:
-        """Columns that the rows of both curves begin with."""
+        """Return the first columns of a row, which are the same in both learning curves."""
         return {
             "update": self._update,
             "steps": self._steps,
@@ -310,7 +310,7 @@ class _Run:
         }
 
     def _validate(self, weeks: DataCenterWeeks) -> Validation:
-        """Run the policy in the validation weeks, and save it if its figure is lowest so far."""
+        """Run the policy in the validation weeks, and save it if its objective is a new minimum."""
         policy = self._policy()
         validation = validate(PolicyController(policy, weeks.sim.fleet), weeks)
         if self._best is None or validation.change_pct < self._best.change_pct:
@@ -319,7 +319,7 @@ class _Run:
         return validation
 
     def result(self) -> Training:
-        """Folder, length and best policy of the training."""
+        """Return folder, length and best policy of the training."""
         return Training(
             folder=self._folder,
             updates=self._update,
@@ -331,22 +331,22 @@ class _Run:
 
     @property
     def _steps(self) -> int:
-        """Steps of all data centers together that are done."""
+        """Number of steps done, summed over all data centers."""
         return self._update * self._steps_each
 
     @property
     def _seconds(self) -> float:
-        """Seconds that all processes of the training took."""
+        """Total time of all processes of the training, in s."""
         return time.perf_counter() - self._begun
 
     def _is_due(self, interval: int) -> bool:
-        """Whether the last update is the final one, or passed a multiple of ``interval`` steps."""
+        """Return True if the last update reached a multiple of ``interval`` steps, or the end."""
         if self._update == self._updates:
             return True
         return self._steps // interval > (self._steps - self._steps_each) // interval
 
     def _learn(self) -> dict[str, float]:
-        """Make an update, and refuse numbers and networks that are not finite."""
+        """Make an update and return the values to log; raise an error if the training diverged."""
         try:
             numbers = self._algorithm.update(self._stream)
             numbers |= {f"return/{name}": x for name, x in self._stream.returns.items()}
@@ -361,7 +361,7 @@ class _Run:
         return numbers
 
     def _write_checkpoint(self) -> None:
-        """Write the policy and a checkpoint.
+        """Write the current policy, and then the checkpoint.
 
         Raises:
             SdcError: a file cannot be written.
@@ -379,7 +379,7 @@ class _Run:
         self._checkpoint_update = self._update
 
     def _policy(self) -> Policy:
-        """The policy as it is."""
+        """Return the current policy."""
         about = About(
             algorithm=self._settings.algorithm,
             seed=self._settings.seed,
@@ -397,35 +397,35 @@ class _Run:
 
 
 class Algorithm(Protocol):
-    """A learning algorithm, which acts in a stream of environments and updates networks."""
+    """Learning algorithm, which acts in a stream of environments and updates its networks."""
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Act for some steps, learn, and return numbers to log by name."""
+        """Act for some steps, learn from them, and return values to log by name."""
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """Networks of the current policies."""
+        """Return the networks of the current policies."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state, from which the training continues to the same bits."""
+        """Return the complete state, from which a training continues with identical results."""
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` of an algorithm of equal settings returned."""
+        """Restore a state from ``state_dict`` of an algorithm with the same settings."""
 
 
 def make_algorithm(
     name: str, settings: LearningSettings, stream: EnvironmentStream, *, updates: int, seed: int
 ) -> Algorithm:
-    """Make an algorithm, before its first update.
+    """Create an algorithm in its state before the first update.
 
     Args:
         name: name of the algorithm.
         settings: settings of the algorithm.
         stream: the environments to learn in.
-        updates: number of updates of the whole training.
+        updates: total number of updates of the training.
         seed: seed of all random numbers of the algorithm.
 
     Raises:
-        ConfigError: actions that the algorithm cannot decide, or fewer data centers than it needs.
+        ConfigError: the algorithm does not support the type of actions, or needs more data centers.
     """
     match settings:
         case OnPolicySettings():
@@ -438,11 +438,11 @@ def make_algorithm(
 
 
 def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
-    """The data centers of a training.
+    """Create the batch of environments of a training.
 
     Raises:
-        SdcError: a configuration or option that is not valid, or fewer data centers than sites and
-            weeks.
+        SdcError: a configuration or option is not valid, or the number of data centers is smaller
+            than the number of pairs of site and week.
     """
     configs = settings.data_centers_of_weeks()
     count = settings.data_centers
@@ -459,7 +459,7 @@ def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
 
 
 def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> EnvironmentStream:
-    """The stream that the algorithm of a training learns from."""
+    """Create the stream of environments from which the algorithm of a training learns."""
     learning = settings.learning
     return EnvironmentStream(
         env,
@@ -468,19 +468,19 @@ def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> Environ
         levels=learning.levels,
         shares_state=uses_state(settings.algorithm, settings.learning),
         against_idle=isinstance(learning, ActingSettings) and learning.against_idle,
-        # No two trainings share the seed of a data center.
+        # Trainings with different seeds must have no data-center seed in common.
         seed=settings.seed * env.num_envs,
     )
 
 
 def check_numbers(numbers: Mapping[str, float]) -> None:
-    """Refuse numbers of an update that has diverged.
+    """Check the logged values of an update for divergence.
 
     Args:
-        numbers: numbers of the update by name.
+        numbers: logged values of the update by name.
 
     Raises:
-        SdcError: a number that is not finite, or a loss that is beyond all measure.
+        SdcError: a value is not finite, or a loss is above ``LARGEST_LOSS``.
     """
     for name, value in numbers.items():
         kind, _, whose = name.partition("/")
@@ -494,7 +494,7 @@ def check_numbers(numbers: Mapping[str, float]) -> None:
 
 
 def _fingerprint(settings: TrainingSettings, env: MultiAgentVectorEnv) -> str:
-    """Fingerprint of the simulator and of all settings but ``steps``."""
+    """Return a fingerprint of the simulator and of all settings except ``steps``."""
     digest = hashlib.sha256(env.core.sim.fingerprint().encode())
     digest.update(settings.model_copy(update={"steps": 1}).to_yaml().encode())
     return digest.hexdigest()
@@ -502,7 +502,7 @@ def _fingerprint(settings: TrainingSettings, env: MultiAgentVectorEnv) -> str:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Let PyTorch use one thread: faster than several for networks of this size, and repeatable."""
+    """Limit PyTorch to one thread, which is reproducible and faster for small networks."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,6 +1,6 @@
 """Settings of a training: algorithm, data centers, environments, validation and checkpoints.
 
-They are YAML as configurations are, and no PyTorch is needed to read and check them.
+Settings are written as YAML, as configurations are. This module does not import PyTorch.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
-"""Sites of all scenarios."""
+"""Sites (US states) of the data centers in every scenario."""
 _FLEXIBLE = {
     "workload": {"flexible_share": 0.4, "queue_limit_h": 5.0},
     "battery": {
@@ -55,7 +55,8 @@ _FLEXIBLE = {
         "discharge_limit_c_rate": 0.25,
     },
 }
-"""Twice the work that may wait, and a battery of four hours."""
+"""Overrides for more flexible data centers: a larger share of deferrable work, and a battery that
+stores the design load of four hours."""
 _BILL = {"rewards": "bill"}
 _EVENTS = [
     {"kind": "crac_down", "per_year": 26, "duration_h": [2, 24]},
@@ -69,10 +70,11 @@ _FAILURES = {
     "protection": {"ashrae_class": "A1"},
     "events": {"sampled": _EVENTS},
 }
-"""Four CRAC units without a spare one, servers of class A1, and failures and heat waves that come
-ten times as often as in practice, so that a few weeks have some."""
+"""Overrides for data centers with failures: four CRAC units without redundancy, servers of ASHRAE
+class A1, and failures and heat waves ten times as frequent as in practice, so that they occur even
+in a few weeks."""
 _COOL = {"agent_dc": {"cooling_carbon": 10.0, "hot_inlets": 1.0}}
-"""Rewards as by default, with ten times the weight of hot inlets."""
+"""Default rewards with ten times the weight of hot server inlets."""
 SCENARIOS: Mapping[str, Mapping[str, Any]] = {
     "carbon": {"sites": SITES},
     "carbon-rich": {"sites": SITES, "overrides": _FLEXIBLE},
@@ -90,32 +92,35 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
         "validation": {"optimum": False},
     },
 }
-"""Settings of each scenario, all of preset ``corrected``: the carbon of the hall as it is, the same
-with twice the work that may wait and a battery of four hours, and of both the electricity bill,
-which is energy by time of use and a demand charge; and carbon where cooling fails and hot inlets
-cost."""
+"""Training settings of each scenario. All scenarios use preset ``corrected``: ``carbon`` minimises
+carbon emissions, ``bill`` the electricity bill (time-of-use energy prices and a demand charge).
+Scenarios ``-rich`` have more deferrable work and a larger battery. ``failures`` minimises carbon
+emissions with failing cooling equipment and a penalty for hot server inlets."""
 
 CI_LEADS_H = tuple(range(1, 25))
-"""Leads of the forecasts of carbon intensity and price that trained agents observe, in h."""
+"""Lead times of the carbon-intensity and price forecasts that agents observe, in h."""
 SETPOINT_CHANGE_K = 0.5
-"""Largest change of the setpoint in a step by trained agents, who hold it for some steps, in K."""
+"""Maximum setpoint change per step in trainings, in K; small because actions are repeated for
+several steps."""
 _SHAPE_OF_DAY = ("ci_rank", "ci_relative", "ci_swing")
 _OWN_PARTS = ("default", "bill")
-"""Rewards that pay each agent for its own part; sharing rewards would add noise."""
+"""Reward functions in which each agent's reward depends on its own part of the data center; sharing
+such rewards between agents would only add noise."""
 _PRICES = ("price", "price_forecast")
 
 
 def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Default options of environments for trainings, below the options that are set.
+    """Return the default environment options of trainings.
 
-    Actions are continuous, and agents observe the hourly shape of the coming day: the carbon
-    intensity relative to its range and, with rewards ``bill``, the price.
+    By default, actions are continuous, and agents observe hourly forecasts for the coming day: the
+    carbon intensity relative to its range and, with rewards ``bill``, the price.
 
     Args:
-        options: options that the user or a scenario sets, by name.
+        options: options that the user or a scenario sets, by name; they take precedence over the
+            defaults.
     """
     agents, commands = options.get("agents") or AGENTS, options.get("commands") or {}
-    # Invalid values are refused later, together with those of all other options.
+    # Ignore invalid values here; they are reported when all options are validated.
     agents = [x for x in agents if x in AGENTS] if isinstance(agents, list | tuple) else []
     commands = commands if isinstance(commands, Mapping) else {}
     defaults: dict[str, Any] = {}
@@ -135,7 +140,7 @@ def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _features(agent: str, options: Mapping[str, Any]) -> tuple[str, ...]:
-    """Default features of an agent, with hourly forecasts in place of those they replace."""
+    """Return the default features of an agent, with hourly instead of coarse forecasts."""
     names = AGENT_DEFINITIONS[agent].features
     if agent == "agent_dc":
         return (*(name for name in names if name != "ci_forecast"), "queue")
@@ -145,31 +150,32 @@ def _features(agent: str, options: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 MOST_STEPS = 10**12
-"""Largest number of steps of a training: years of the fastest machine."""
+"""Maximum number of steps of a training; even the fastest machine would take years for it."""
 Week = Annotated[int, Field(strict=True, ge=0, lt=WEEKS)]
 """Week of the year, 0..51."""
 _FIXED_BY_WEEKS = ("start", "months")
 
 Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
-"""Number of steps of all data centers together, 1..1e12."""
+"""Number of steps, summed over all data centers, 1..1e12."""
 
 
 class ValidationSettings(Section):
     """Settings of the validation weeks, by which a training chooses its best policy."""
 
     steps: Annotated[int, Field(strict=True, ge=0, le=MOST_STEPS)] = 200_000
-    """Steps of all data centers together between two validations, 0..1e12; 0 is no validation."""
+    """Number of steps between two validations, summed over all data centers, 0..1e12; 0 disables
+    validation."""
     weeks: Literal["validation"] | tuple[Week, ...] = "validation"
-    """Weeks of the year, 0..51; ``validation`` is weeks 1, 9, ..., 49."""
+    """Weeks of the year, 0..51; ``validation`` stands for weeks 1, 9, ..., 49."""
     days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
-    """Days of each week that are run, 2..7; the first is not scored."""
+    """Number of days simulated in each week, 2..7; the first day is not scored."""
     objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
-    """Objective whose share of the achievable is measured: ``carbon``, ``energy``, ``cost``,
-    ``water``, or a sum such as ``carbon+0.002*water``."""
+    """Objective by which policies are compared: ``carbon``, ``energy``, ``cost``, ``water``, or a
+    sum such as ``carbon+0.002*water``."""
     optimum: bool = True
-    """Whether to solve, once, for the optimum of these weeks, which values stored energy and
-    waiting work at their ends and gives the share of the achievable; else policies are compared
-    with idle commands alone."""
+    """True to compute the optimum of the validation weeks once. It gives the share of the
+    achievable saving, and the value of stored energy and waiting work at the end of a week. False
+    to compare policies with idle commands only."""
 
     @field_validator("weeks")
     @classmethod
@@ -178,49 +184,49 @@ class ValidationSettings(Section):
 
 
 class TrainingSettings(Section):
-    """Everything that decides a training."""
+    """All settings of a training; they determine its result."""
 
     algorithm: str
     """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn``,
     ``hasac`` or ``cross-entropy``."""
     scenario: str | None = None
-    """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill``,
-    ``bill-rich`` or ``failures``; None is none."""
+    """Scenario that provides default settings: ``carbon``, ``carbon-rich``, ``bill``,
+    ``bill-rich`` or ``failures``; None selects no scenario."""
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] = "corrected"
-    """Data center: a preset, a file, or the sections of a configuration."""
+    """Configuration of the data center: a preset, a file, or the sections of a configuration."""
     overrides: dict[str, Any] = Field(default={})
-    """Values put into the configuration, section by section."""
+    """Values that replace those of the configuration, by section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
-    """Sites, one data center for each; none is the site of the configuration."""
+    """Sites, with one data center for each site; an empty list selects the configuration's site."""
     weeks: Literal["training"] | tuple[Week, ...] | None = "training"
-    """Weeks of the year, 0..51, that episodes begin in, one data center for each site and week;
-    ``training`` is all that are neither held out nor for validation, None takes the first days
-    from ``environment``."""
+    """Weeks of the year, 0..51, in which episodes begin, with one data center for each site and
+    week. ``training`` stands for all weeks that are neither held out nor used for validation. None
+    takes the first days of episodes from ``environment``."""
     data_centers: Annotated[int, Field(strict=True, ge=1, le=1_000_000)] | None = None
-    """Number of data centers at once, to which those of all sites and weeks are dealt in turn; None
-    is the smallest multiple of theirs from 256 on."""
+    """Number of data centers that are simulated at once. The pairs of site and week are assigned to
+    them in turn. None selects the smallest multiple of the number of pairs that is at least 256."""
     environment: EnvOptions = EnvOptions()
     """Options of the environments, as in docs/environments.md."""
     precision: Literal["f32", "f64"] = "f32"
     """Precision of the server kernels."""
     steps: Steps = 2_000_000
-    """Steps of all data centers together, 1..1e12; those of a last update that would exceed it are
-    left out."""
+    """Maximum number of steps, summed over all data centers, 1..1e12; the training makes as many
+    complete updates as fit."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
     """Seed of networks, actions, mini-batches and episodes, 0..2^31 - 1."""
     learning: SerializeAsAny[LearningSettings] = Field(default={}, validate_default=True)
     """Settings of the algorithm."""
     checkpoint_steps: Steps = 100_000
-    """Steps of all data centers together between two checkpoints, 1..1e12."""
+    """Number of steps between two checkpoints, summed over all data centers, 1..1e12."""
     validation: ValidationSettings = ValidationSettings()
-    """Weeks in which policies are tried."""
+    """Settings of the validation, by which the best policy is chosen."""
     tensorboard: bool = True
-    """Whether to write TensorBoard events."""
+    """True to write TensorBoard events."""
 
     @model_validator(mode="before")
     @classmethod
     def _on_top_of_scenario(cls, values: Any) -> Any:
-        """Merge the values with those of their scenario and the defaults of all trainings."""
+        """Add the values of the scenario, and the defaults of all trainings, to those given."""
         if not isinstance(values, Mapping):
             return values
         name = values.get("scenario")
@@ -245,7 +251,7 @@ class TrainingSettings(Section):
     @field_validator("config")
     @classmethod
     def _found_from_anywhere(cls, value: Any) -> Any:
-        """Files by their absolute path, as a training may be resumed elsewhere."""
+        """Replace file names by absolute paths, as a training may be resumed in another folder."""
         is_file = isinstance(value, str) and value not in preset_names() and os.path.isfile(value)
         return os.path.abspath(value) if is_file else value
 
@@ -270,7 +276,7 @@ class TrainingSettings(Section):
     @field_validator("learning", mode="before")
     @classmethod
     def _of_the_algorithm(cls, value: Any, info: Any) -> Any:
-        """Settings of the class that the algorithm has."""
+        """Convert plain values to the settings class of the algorithm."""
         kind = LEARNING_SETTINGS.get(info.data.get("algorithm"))
         if kind is None or isinstance(value, kind):
             return value
@@ -279,7 +285,7 @@ class TrainingSettings(Section):
     @field_validator("environment")
     @classmethod
     def _plain(cls, value: EnvOptions) -> EnvOptions:
-        """Refuse objects, which cannot be written down."""
+        """Refuse Python objects as options, because they cannot be written as YAML."""
         for name in value.model_fields_set:
             option = getattr(value, name)
             if callable(option) or (name == "others" and not isinstance(option, str)):
@@ -291,7 +297,7 @@ class TrainingSettings(Section):
 
     @field_serializer("environment")
     def _options_set(self, value: EnvOptions) -> dict[str, Any]:
-        """The options that were set: others would be errors, or follow from these."""
+        """Return the options that were set explicitly and differ from the defaults of trainings."""
         dumped = value.model_dump(mode="json", exclude_unset=True)
         follow = json.loads(json.dumps(training_environment(dumped)))
         return {k: v for k, v in dumped.items() if k not in follow or v != follow[k]}
@@ -313,38 +319,38 @@ class TrainingSettings(Section):
         return self
 
     def to_yaml(self) -> str:
-        """YAML text that ``load_settings`` reads back equal."""
+        """Return the settings as YAML text, from which ``load_settings`` reads equal settings."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
 
     def options(self) -> EnvOptions:
-        """Options of the environments, with the first days that ``weeks`` fixes."""
+        """Return the options of the environments; if ``weeks`` is set, first days are fixed."""
         if self.weeks is None:
             return self.environment
         return EnvOptions.model_validate(_set_options(self.environment) | {"start": "fixed"})
 
     def _config(self) -> DataCenterConfig:
-        """The data center, with its overrides, before sites and weeks."""
+        """Return the configuration with its overrides, before sites and weeks are applied."""
         overrides = dict(leaves("", self.overrides))
         if isinstance(self.config, str):
             return load_config(self.config, [f"{k}={json.dumps(v)}" for k, v in overrides.items()])
         return with_values(config_from_dict(self.config), overrides)
 
     def data_centers_of_weeks(self) -> list[DataCenterConfig]:
-        """Data centers to train in: one for each site and week, site by site.
+        """Return the data centers of the training: one for each site and week, site by site.
 
         Raises:
-            ConfigError: a file, value or site that is not valid.
+            ConfigError: a file, value or site is not valid.
         """
-        of_sites = self.data_centers_of_sites()
+        configs = self.data_centers_of_sites()
         if self.weeks is None:
-            return of_sites
-        return data_center_weeks(of_sites, TRAINING if self.weeks == "training" else self.weeks)
+            return configs
+        return data_center_weeks(configs, TRAINING if self.weeks == "training" else self.weeks)
 
     def data_centers_of_sites(self) -> list[DataCenterConfig]:
-        """One data center for each site, or that of the configuration.
+        """Return one data center for each site; without ``sites``, that of the configuration.
 
         Raises:
-            ConfigError: a file, value or site that is not valid.
+            ConfigError: a file, value or site is not valid.
         """
         config, tariff = self._config(), self.environment.tariff
         if tariff is not None:
@@ -352,7 +358,7 @@ class TrainingSettings(Section):
         return make_configs(config, sites=self.sites)
 
     def difference(self, other: TrainingSettings) -> str | None:
-        """The first setting but ``steps`` in which others differ, with both values.
+        """Describe the first setting that differs, ignoring ``steps``; None if all are equal.
 
         Args:
             other: settings to compare with.
@@ -367,14 +373,14 @@ class TrainingSettings(Section):
 
 
 def make_settings(values: Mapping[str, Any], label: str = "settings") -> TrainingSettings:
-    """Settings of plain values.
+    """Create checked settings from plain values.
 
     Args:
         values: settings as in a YAML file.
-        label: where they come from, at the start of every message.
+        label: origin of the values, which begins every error message.
 
     Raises:
-        ConfigError: naming the setting, its value and what would be valid.
+        ConfigError: a setting is not valid; the message names it, its value and valid values.
     """
     return validated(TrainingSettings, values, label)
 
@@ -384,10 +390,11 @@ def load_settings(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -
 
     Args:
         path: the file.
-        overrides: ``a.b=c`` assignments applied last.
+        overrides: assignments ``a.b=c``, which take precedence over the file.
 
     Raises:
-        ConfigError: naming the file, the setting, its value and what would be valid.
+        ConfigError: a setting is not valid; the message names the file, the setting, its value and
+            valid values.
     """
     values = read_values(path)
     for override in overrides:
@@ -396,10 +403,10 @@ def load_settings(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -
 
 
 def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Plain values of a YAML file of settings, not yet checked.
+    """Read plain values from a YAML file of settings, without checking the settings.
 
     Raises:
-        ConfigError: no such file, or no YAML.
+        ConfigError: the file does not exist, or is not valid YAML.
     """
     try:
         values = load_yaml(read_text(path, MOST_CONFIG_BYTES, ConfigError))
@@ -415,14 +422,14 @@ def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _weeks_once(value: Any) -> Any:
-    """Weeks of the year, at least one and each once; other values as they are."""
+    """Check that a tuple of weeks is not empty and has no duplicates; return the value."""
     if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
         raise ValueError(f"{list(value)}; valid is one or more weeks, each once")
     return value
 
 
 def whole_steps(value: Any) -> Any:
-    """A number of steps that may be written as ``2e6``; other values as they are."""
+    """Convert a number of steps such as ``2e6`` to an integer; return other values unchanged."""
     if isinstance(value, str):
         try:
             value = parse_number(value)
@@ -432,11 +439,11 @@ def whole_steps(value: Any) -> Any:
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Values with some of them replaced, section by section.
+    """Merge two nested mappings, section by section.
 
     Args:
-        base: the values.
-        over: values that replace those of ``base``; a section may be an object.
+        base: values of lower precedence.
+        over: values that replace those of ``base``; a section may be an ``EnvOptions`` object.
     """
     out = dict(base)
     for key, value in over.items():
@@ -450,16 +457,16 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _set_options(options: EnvOptions) -> dict[str, Any]:
-    """Options that were set explicitly, by name; setting others could be an error."""
+    """Return the explicitly set options by name; setting the others could be an error."""
     return {name: getattr(options, name) for name in options.model_fields_set}
 
 
 def leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Values that are no sections, by their dotted paths.
+    """Yield the dotted path and the value of each leaf of a nested mapping.
 
     Args:
-        path: dotted path of the values; empty at the top.
-        values: the values.
+        path: dotted path of ``values``; empty at the top level.
+        values: the nested mapping.
     """
     for key, value in values.items():
         name = f"{path}.{key}".lstrip(".")
