@@ -1,4 +1,4 @@
-"""Run the jobs of a study in worker processes of this machine, and keep their results."""
+"""Execution of a study's jobs in worker processes of this machine, and storage of the results."""
 
 from __future__ import annotations
 
@@ -22,38 +22,39 @@ from sdc_taichi.errors import ConfigError, SdcWarning, whole_number
 from sdc_taichi.kernels.compiler.runtime import allowed_processors, processor_quota
 
 MOST_WORKERS = 1024
-"""Largest number of worker processes."""
+"""Maximum number of worker processes."""
 MOST_ATTEMPTS = 3
-"""Number of times that a job is begun if its process is killed each time."""
+"""Maximum number of attempts for a job whose process is killed."""
 _POLL_S = 0.1
 _GRACE_S = 5.0
 
 Stop = Callable[[], bool]
-"""Returns true once work is to end early; polled."""
+"""Function that is called repeatedly, and returns true to end the work early."""
 
 
 class Executor:
-    """Runs jobs one after the other in this process; subclasses run them in worker processes.
+    """Executor that runs jobs one after another in this process.
 
-    As a context manager it ends its workers, and the jobs that they run.
+    Subclasses run jobs in worker processes. The end of a ``with`` block ends the workers and their
+    jobs.
     """
 
     @property
     def workers(self) -> int:
-        """Number of jobs that run at a time."""
+        """Number of jobs that run at the same time."""
         return 1
 
     def results(self, jobs: Iterator[Job], inputs: Inputs, stop: Stop) -> Iterator[DoneJob]:
-        """Run jobs, and yield each one when it has ended.
+        """Run jobs, and yield each job when it has ended.
 
         Args:
-            jobs: the jobs; at most 2 per worker are taken before others have ended.
+            jobs: the jobs; at most 2 jobs per worker are taken from the iterator in advance.
             inputs: content of all inputs that jobs read, by name.
-            stop: once true, the iteration ends, and jobs that run in other processes.
+            stop: if it returns true, the iteration and the jobs in worker processes end.
 
         Yields:
-            Jobs that have ended, successfully or not, in order of completion. A job that is lost
-            with its worker is run again and yielded once.
+            Jobs that have ended, successfully or not, in order of completion. A job whose worker is
+            lost is repeated, and yielded only once.
         """
         for job in jobs:
             if stop():
@@ -68,16 +69,17 @@ class Executor:
 
 
 class LocalProcesses(Executor):
-    """Runs jobs in spawned processes of one thread each, which end with this process.
+    """Executor that runs jobs in single-threaded worker processes, which end with this process.
 
-    Each process is a pool of its own, so that a process that is killed loses the job that it runs
-    and no other. The job begins again in another process, ``MOST_ATTEMPTS`` times in all.
+    Each worker process is a separate pool, so that a killed process affects only its current job.
+    The job is repeated in another process, with at most ``MOST_ATTEMPTS`` attempts in total.
 
     Args:
-        workers: number of processes; None is one for each processor that this process may use.
+        workers: number of processes; None selects the number of processors available to this
+            process.
 
     Raises:
-        ConfigError: a number that is not valid.
+        ConfigError: the number of processes is not valid.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -86,11 +88,11 @@ class LocalProcesses(Executor):
 
     @property
     def workers(self) -> int:
-        """Number of processes."""
+        """Number of worker processes."""
         return self._workers
 
     def results(self, jobs: Iterator[Job], inputs: Inputs, stop: Stop) -> Iterator[DoneJob]:
-        """Run jobs as ``Executor.results`` does."""
+        """Run jobs as described in ``Executor.results``."""
         before = set(multiprocessing.active_children())
         idle: list[ProcessPoolExecutor] = []
         waiting: Iterator[tuple[Job, int]] = zip(jobs, itertools.repeat(1))
@@ -128,15 +130,15 @@ class JobSummary:
     done: int
     """Number of jobs that were run successfully."""
     kept: int
-    """Number of jobs whose results existed already."""
+    """Number of jobs that were skipped because their results already existed."""
     failed: tuple[tuple[str, str], ...]
     """Name and error of each job that failed."""
     is_whole: bool
-    """True unless an interruption left jobs out."""
+    """True if all jobs were processed; False after an interruption."""
 
 
 def default_workers() -> int:
-    """Number of processors that this process may use, within the quota of its container."""
+    """Return the number of processors available to this process, within its container's quota."""
     return int(min(len(allowed_processors()), processor_quota(), MOST_WORKERS))
 
 
@@ -149,18 +151,18 @@ def run_jobs(
     stop: Stop = lambda: False,
     on_done: Callable[[Job, DoneJob | None], None] = lambda *_: None,
 ) -> JobSummary:
-    """Run the jobs that are not done, and keep their results.
+    """Run the jobs whose results do not exist yet, and store their results.
 
-    Memory does not grow with the number of jobs, except for their names. Warnings of jobs are
-    issued again here.
+    Only the names of the jobs remain in memory. Warnings that a worker recorded during a job are
+    issued again in this process.
 
     Args:
-        jobs: the jobs, which may be generated as they are needed.
-        store: where results are kept; its folder is claimed.
-        executor: runs the jobs.
-        inputs: content of inputs by name. A job fails if one of its inputs is not among them.
-        stop: once true, the work ends with what is done.
-        on_done: called with each job and its outcome; None if its result existed already.
+        jobs: the jobs; a generator can create them on demand.
+        store: storage of the results, whose folder must be claimed.
+        executor: executor of the jobs.
+        inputs: content of inputs by name. A job fails if one of its inputs is missing.
+        stop: if it returns true, the work ends; the results so far are stored.
+        on_done: called with each job and its outcome, which is None if the result already existed.
 
     Raises:
         ConfigError: two jobs have the same partition.
@@ -169,7 +171,7 @@ def run_jobs(
     contents = inputs or {}
     partitions: set[tuple[str, ...]] = set()
     failed: list[tuple[str, str]] = []
-    taken = kept = done = 0
+    running = kept = done = 0
     is_exhausted = False
 
     def fail(ended: DoneJob) -> None:
@@ -177,7 +179,7 @@ def run_jobs(
         on_done(ended.job, ended)
 
     def to_do() -> Iterator[Job]:
-        nonlocal taken, kept, is_exhausted
+        nonlocal running, kept, is_exhausted
         for job in jobs:
             if stop():
                 return
@@ -192,12 +194,12 @@ def run_jobs(
             elif missing is not None:
                 fail(DoneJob(job, f"input {missing} is missing, because its job has failed"))
             else:
-                taken += 1
+                running += 1
                 yield job
         is_exhausted = True
 
     for ended in executor.results(to_do(), contents, stop):
-        taken -= 1
+        running -= 1
         for text in ended.warnings:
             warnings.warn(text, SdcWarning, stacklevel=2)
         if ended.error:
@@ -206,20 +208,21 @@ def run_jobs(
             store.keep(ended)
             done += 1
             on_done(ended.job, ended)
-    return JobSummary(done, kept, tuple(failed), is_exhausted and not taken)
+    return JobSummary(done, kept, tuple(failed), is_exhausted and not running)
 
 
 def _pool_of_one(inputs: Inputs) -> ProcessPoolExecutor:
-    """A pool of one worker process, which gets the inputs when it starts."""
+    """Return a pool with one worker process, which receives the inputs when it starts."""
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, context, _begin_worker, (inputs,))
 
 
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C; processes that start meanwhile inherit this.
+    """Block the signal of Ctrl-C in this process and in processes that start inside the block.
 
-    A terminal sends Ctrl-C to all processes, including those that are still importing modules.
+    A terminal sends the signal to all processes, including workers that are still importing
+    modules and cannot handle it yet.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -232,7 +235,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _end(processes: Iterable[multiprocessing.process.BaseProcess]) -> None:
-    """End processes, after some time in which they can delete their temporary files."""
+    """Terminate processes; kill them after a grace period for deleting temporary files."""
     for process in processes:
         process.terminate()
     deadline_s = time.monotonic() + _GRACE_S
@@ -244,18 +247,18 @@ def _end(processes: Iterable[multiprocessing.process.BaseProcess]) -> None:
 
 
 def _killed(attempts: int) -> str:
-    """Error of a job whose process was killed each time."""
+    """Return the error message of a job whose process was killed in every attempt."""
     return (
         f"its process was killed {attempts} times; memory may be short, and fewer --jobs need less"
     )
 
 
 _inputs: dict[str, bytes] = {}
-"""Inputs of the jobs of this process, if it is a worker."""
+"""Inputs of jobs, if this process is a worker."""
 
 
 def _begin_worker(inputs: Inputs) -> None:
-    """Prepare a worker process."""
+    """Prepare a worker process: signals, monitoring of the parent, one thread, inputs."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -267,18 +270,18 @@ def _run_in_worker(job: Job) -> DoneJob:
     """Run a job in a worker process."""
     try:
         return run_job(job, _inputs)
-    except SystemExit:  # temporary files are deleted; a pool would go on with its next job
+    except SystemExit:  # end the process here, as the pool would continue with its next job
         os._exit(1)
 
 
 def _exit(*_: Any) -> None:
-    """End this process by an exception, so that its temporary files are deleted."""
+    """Signal handler that ends the process by an exception, so that temporary files are deleted."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise SystemExit(1)
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it has ended, by whatever cause."""
+    """Wait for the end of the parent process, for any reason, and then end this process."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

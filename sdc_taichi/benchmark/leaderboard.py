@@ -1,8 +1,11 @@
-"""Tables of the rows of a case: standings with places, pairs of rows, and performance profiles.
+"""Tables that compare the rows of a case: ranking, pairwise differences, and performance profiles.
 
-Rows share a place unless the 95 % intervals of all paired differences between them and the rows of
-the next place exclude 0. The order within a place is that of the suite and has no meaning. Rows
-with too few weeks or seeds for an interval have no place.
+A row is an entry of a suite: a controller, or a method that finds one. Two groups of rows have
+different ranks ("places") only if the 95 % intervals of all paired differences between them exclude
+0; otherwise the rows share a rank. The order of rows with a shared rank has no meaning. Rows with
+too few weeks or seeds for a confidence interval have no rank.
+
+A "figure" is the value of the objective (lower is better).
 """
 
 from __future__ import annotations
@@ -48,7 +51,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 THRESHOLDS_PCT = (0.0, 25.0, 50.0, 75.0, 90.0)
-"""Shares of the achievable at which tables show performance profiles, in %."""
+"""Thresholds of the share of the achievable saving in performance profiles, in %."""
 CONSTRAINTS = {
     "throttled_rack_h": "throttled (rack h)",
     "tripped_rack_h": "tripped (rack h)",
@@ -56,9 +59,9 @@ CONSTRAINTS = {
     "unmet_cooling_kwh": "heat left (kWh)",
     "lost_tasks": "lost (tasks)",
 }
-"""Metrics, as means of a week, that get a column if any row has a value other than 0."""
+"""Titles of constraint metrics (mean per week), shown if any row has a value other than 0."""
 OUTAGES = ("throttled_rack_h", "tripped_rack_h", "unserved_kwh", "lost_tasks")
-"""Those of them that lower emissions because less work is done."""
+"""Constraint metrics that reduce emissions because less work is done."""
 BOARD_TITLES = {
     **TITLES,
     **CONSTRAINTS,
@@ -74,12 +77,12 @@ BOARD_TITLES = {
 }
 """Titles of columns in tables of this module."""
 _Samples = Mapping[str, tuple[F64, F64]]
-"""Figures of each row by seed and week, (S, W), and those of idle commands, of ``samples``."""
+"""Objective of each row by seed and week, (S, W), and of idle commands, as from ``samples``."""
 FEWEST = 3
-"""Weeks of a site, and seeds of what was trained, from which intervals rank rows."""
+"""Minimum number of weeks per site, and of seeds per trained row, for intervals and ranks."""
 _SEED = 0
 _LEAST_POINTS = 1e-9
-"""Difference up to which two changes against idle commands are equal, in points."""
+"""Difference up to which two changes count as equal, in percentage points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,26 +94,28 @@ class Leaderboard:
     evaluation: Evaluation
     """The results as an evaluation."""
     standings: pd.DataFrame
-    """A row for each row of the case, by place: changes against idle commands, share of the
-    achievable, other quantities, seeds and processor time."""
+    """Ranking of the rows: changes against idle commands, share of the achievable saving, other
+    metrics, seeds and processor time."""
     pairs: pd.DataFrame
-    """Differences of rows, in points of the change against idle commands, with the probability of
-    improvement: each row against the best rule, and against the row below it."""
+    """Differences between the change of each row and that of the best rule or of the row below, in
+    percentage points, with the probability of improvement."""
     profiles: pd.DataFrame
-    """Share of weeks above thresholds of the share of the achievable, in %; empty without an
-    optimum."""
+    """Share of weeks, in %, in which a row exceeds thresholds of the share of the achievable
+    saving; empty without an optimum."""
     coordination: pd.DataFrame
-    """Savings of the agents of a row alone and together; empty where none ran alone."""
+    """Savings of each agent of a row alone, and of all agents together; empty if no agent ran
+    alone."""
     apart: pd.DataFrame
-    """Rows whose agents were trained apart against those that were trained together."""
+    """Comparison of rows whose agents were trained together with rows whose agents were trained
+    separately."""
     sites: pd.DataFrame
     """Change against idle commands in %, by row and site."""
     best_rule: str
-    """The rule with the lowest figure; empty where there is none."""
+    """Name of the rule-based controller with the lowest objective; empty without rules."""
 
 
 def leaderboard(case: CaseResults) -> Leaderboard:
-    """Compare the rows of a case.
+    """Compute all tables that compare the rows of a case.
 
     Args:
         case: results of the case.
@@ -139,18 +144,20 @@ def leaderboard(case: CaseResults) -> Leaderboard:
 
 
 def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, tuple[int, int]]:
-    """Places of rows, of which several share one unless intervals separate them.
+    """Return the rank of each row; rows share a rank unless confidence intervals separate them.
 
-    Places part between two sets of rows where each row of one is better than each of the other:
-    where the interval of the difference of the two, draw by draw, lies below 0.
+    The ranking is divided between two groups if each row of the upper group is better than each row
+    of the lower group. A row is better than another if the 95 % interval of their paired difference
+    is below 0.
 
     Args:
-        values: figure of each row, less is better.
-        drawn: figure of each row in the draws of a bootstrap, the same weeks for all rows.
+        values: figure of each row, lower is better.
+        drawn: figures of each row in the bootstrap resamples, which have the same weeks for all
+            rows.
 
     Returns:
-        First and last of the places that a row shares, by row, from the best; rows that share
-        places stand in the order in which they were given.
+        First and last of the ranks that a row shares, by row, best first. Rows with shared ranks
+        are in the order of ``values``.
     """
     order = sorted(values, key=lambda name: values[name])
     position = {name: index for index, name in enumerate(values)}
@@ -166,32 +173,32 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
 
 
 def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
-    """Whether a row has enough weeks and seeds for intervals, and so for a place."""
+    """Return True if a row has enough weeks and seeds for confidence intervals and a rank."""
     seeds = len(case.rows[name])
     weeks = int(np.bincount(evaluation.strata).min())
     return weeks >= FEWEST and (seeds >= FEWEST or case.kinds[name] != LEARNER)
 
 
 def _is_better(one: F64, other: F64) -> bool:
-    """Whether the whole interval of a difference lies below 0, so that the first row is better."""
+    """Return True if the interval of the difference is below 0, so that the first is better."""
     return percentile_interval(0.0, one - other).high < -_LEAST_POINTS
 
 
 def _drawn_changes(evaluation: Evaluation, figures: _Samples) -> dict[str, F64]:
-    """Change of each row against idle commands in each draw of a bootstrap, (draws,) each.
+    """Return the change of each row against idle commands in each bootstrap resample, (draws,).
 
-    Trainings are drawn together if seeds decide inputs.
+    If the seed determines the inputs, all rows have the same resampled seeds.
     """
     changes = {}
     for name, pair in figures.items():
         paired = len(pair[1]) > 1
-        drawn_by = "" if paired else name
-        changes[name] = _bootstrap(evaluation, change_pct, pair, drawn_by, paired=paired)
+        generator_name = "" if paired else name
+        changes[name] = _bootstrap(evaluation, change_pct, pair, generator_name, paired=paired)
     return changes
 
 
 def _generator(name: str = "") -> np.random.Generator:
-    """Generator of draws."""
+    """Return a random generator whose seed depends on a name."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([_SEED, *name.encode()])))
 
 
@@ -201,7 +208,7 @@ def _standings(
     placed: Mapping[str, tuple[int, int]],
     order: list[str],
 ) -> pd.DataFrame:
-    """Rows by place, with their changes and other metrics."""
+    """Return the ranking of the rows, with changes against idle commands and other metrics."""
     import pandas as pd
 
     table = summary(evaluation).rename(columns={"controller": "row"}).set_index("row").loc[order]
@@ -233,7 +240,7 @@ def _pairs(
     order: Sequence[str],
     best: str,
 ) -> pd.DataFrame:
-    """Each row against the best rule, and against the row below."""
+    """Return the comparison of each row with the best rule and with the next row of the order."""
     import pandas as pd
 
     pairs = []
@@ -246,12 +253,12 @@ def _pairs(
 def _difference(
     evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64], one: str, other: str
 ) -> dict[str, Any]:
-    """A row of a table of differences."""
-    (ones, idle), (others, others_idle) = figures[one], figures[other]
-    points = float(change_pct(ones, idle) - change_pct(others, others_idle))
-    pair = ones, others
-    values = _bootstrap(evaluation, probability_of_improvement, pair, paired=len(idle) > 1)
-    probability = float(probability_of_improvement(ones, others))
+    """Return difference and probability of improvement of two rows, as a table row."""
+    (first, first_idle), (second, second_idle) = figures[one], figures[other]
+    points = float(change_pct(first, first_idle) - change_pct(second, second_idle))
+    pair, paired = (first, second), len(first_idle) > 1
+    values = _bootstrap(evaluation, probability_of_improvement, pair, paired=paired)
+    probability = float(probability_of_improvement(first, second))
     return {
         "row": one,
         "than": other,
@@ -268,16 +275,16 @@ def _bootstrap(
     *,
     paired: bool = False,
 ) -> F64:
-    """A statistic in each draw of a bootstrap; weeks of a draw are the same for all rows.
+    """Return a statistic in each bootstrap resample; all rows have the same resampled weeks.
 
-    Trainings are drawn for each row by its name, so that its draws do not depend on other rows.
+    The name of a row determines its resampled trainings, which so do not depend on other rows.
     """
     weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
     return bootstrap_values(statistic, samples, weeks, _generator(name), paired=paired)
 
 
 def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -> pd.DataFrame:
-    """Share of weeks above shares of the achievable, in %."""
+    """Return the share of weeks, in %, in which each row exceeds ``THRESHOLDS_PCT``."""
     import pandas as pd
 
     thresholds = np.array(THRESHOLDS_PCT)
@@ -300,7 +307,7 @@ def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -
 
 
 def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) -> pd.DataFrame:
-    """Savings of each agent alone, the others idle, and of all together."""
+    """Return the savings of each agent alone, with idle others, and of all agents together."""
     import pandas as pd
 
     by_agent = {agent: samples(evaluation, agent) for agent in AGENTS}
@@ -325,7 +332,7 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
 def _apart(
     case: CaseResults, evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64]
 ) -> pd.DataFrame:
-    """Rows whose agents were trained together, against those whose agents were trained alone."""
+    """Compare rows whose agents were trained together with those trained separately."""
     import pandas as pd
 
     trained = {

@@ -1,7 +1,7 @@
-"""Jobs on a Ray cluster, on this machine or on others with the same version of the package.
+"""Execution of jobs on a Ray cluster, on one machine or several with the same package version.
 
-Ray starts the workers, places the jobs, runs again what is lost with a worker or a machine, and
-shows all of it in its dashboard. Nothing is scheduled here.
+Ray does the scheduling: it starts the workers, assigns the jobs, repeats a job if its worker or
+machine is lost, and shows the progress in its dashboard.
 """
 
 from __future__ import annotations
@@ -25,29 +25,31 @@ from sdc_taichi.benchmark.jobs import (
 from sdc_taichi.errors import ConfigError, RuntimeStateError, one_line
 
 LOCAL = "local"
-"""Address of a cluster that is started on this machine, and ends with the study."""
+"""Address that stands for a new cluster on this machine, which ends with the study."""
 _POLL_S = 0.2
 
 
 class RayCluster(Executor):
-    """Runs jobs as tasks of Ray, each on one processor and in one thread.
+    """Executor that runs each job as a Ray task, with one processor and one thread.
 
-    A job whose worker is killed or whose machine is lost is run again on another, ``MOST_ATTEMPTS``
-    times at most. The content of an input travels once to each machine, by Ray's object store.
+    If the worker or the machine of a job is lost, the job is repeated elsewhere, with at most
+    ``MOST_ATTEMPTS`` attempts in total. Ray's object store transfers the content of each input to
+    each machine once.
 
     Args:
-        address: ``local`` starts a cluster on this machine; ``auto`` is the one that runs here, or
-            that the environment variable ``RAY_ADDRESS`` names; else ``HOST:PORT`` of a head node.
-        workers: number of processors of the cluster that is started; None is one for each that
-            this process may use. Other clusters have what their machines have.
+        address: ``local`` starts a cluster on this machine; ``auto`` connects to the cluster that
+            runs on this machine or that the environment variable ``RAY_ADDRESS`` names;
+            ``HOST:PORT`` connects to a head node.
+        workers: number of processors of a cluster with address ``local``; None selects the number
+            of processors available to this process.
 
     Raises:
-        ConfigError: Ray is not installed, or a number of workers with another cluster.
+        ConfigError: Ray is not installed, or ``workers`` is set for an existing cluster.
     """
 
     def __init__(self, address: str = LOCAL, workers: int | None = None) -> None:
-        # Read when Ray is imported: nothing is sent to its makers, and a job that needs more memory
-        # than there is fails some day.
+        # Ray reads these variables when it is imported. They disable usage reports to its
+        # developers, and limit how often a job that exceeds the memory is repeated.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_task_oom_retries", str(MOST_ATTEMPTS - 1))
         try:
@@ -63,21 +65,21 @@ class RayCluster(Executor):
             )
         self._ray: Any = ray
         self._address = address
-        self._started: dict[str, Any] = {}  # what a new cluster is started with
+        self._started: dict[str, Any] = {}  # keyword arguments for starting a new cluster
         if address == LOCAL:
             self._started = {"num_cpus": workers or default_workers(), "include_dashboard": False}
 
     @property
     def workers(self) -> int:
-        """Number of processors of all machines that are in the cluster at present."""
+        """Current number of processors of all machines in the cluster."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 0)))
 
     def results(self, jobs: Iterator[Job], inputs: Inputs, stop: Stop) -> Iterator[DoneJob]:
-        """Run jobs as ``Executor.results`` does.
+        """Run jobs as described in ``Executor.results``.
 
         Raises:
-            RuntimeStateError: a machine of the cluster lacks the package, or has other source files
-                of it.
+            RuntimeStateError: a machine of the cluster lacks the package, or has different source
+                files of the package.
         """
         ray = self._ray
         task = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS - 1)(_run)
@@ -99,15 +101,15 @@ class RayCluster(Executor):
                 yield self._result(reference, running.pop(reference))
 
     def _result(self, reference: Any, job: Job) -> DoneJob:
-        """The job of a task that has ended.
+        """Return the job of a task that has ended, with its result or error.
 
         Raises:
-            RuntimeStateError: the task could not begin, or ran with other source files than those
-                here.
+            RuntimeStateError: the task could not begin, or the source files of the package differ
+                between the worker and this process.
         """
         try:
             done: DoneJob = self._ray.get(reference)
-        except self._ray.exceptions.RayTaskError as error:  # errors of jobs are in their results
+        except self._ray.exceptions.RayTaskError as error:  # not raised for errors inside a job
             raise RuntimeStateError(
                 "a machine of the Ray cluster cannot run jobs; install the same sdc-taichi on all "
                 f"of them: {str(error.cause).splitlines()[0]}"
@@ -122,10 +124,10 @@ class RayCluster(Executor):
         return done
 
     def __enter__(self) -> Self:
-        """Connect to the cluster.
+        """Connect to the cluster, or start it.
 
         Raises:
-            ConfigError: there is none at the address.
+            ConfigError: there is no cluster at the address.
         """
         handler = signal.getsignal(signal.SIGTERM)
         try:
@@ -139,7 +141,7 @@ class RayCluster(Executor):
             ) from error
         finally:
             if threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGTERM, handler)  # Ray sets its own
+                signal.signal(signal.SIGTERM, handler)  # restore, because Ray sets its own handler
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -147,12 +149,12 @@ class RayCluster(Executor):
 
 
 def _run(job: Job, path: Sequence[str], *contents: bytes) -> DoneJob:
-    """Run a job in a worker of Ray.
+    """Run a job in a Ray worker.
 
     Args:
         job: the job.
-        path: folders in which the driver finds modules; those of users are in some of them.
-        *contents: contents of the job's inputs in their order.
+        path: ``sys.path`` of the driver process, so that the worker finds modules of users.
+        *contents: contents of the job's inputs, in the order of ``job.inputs``.
     """
     compute_in_one_thread()
     sys.path += [folder for folder in path if folder not in sys.path]
@@ -160,5 +162,5 @@ def _run(job: Job, path: Sequence[str], *contents: bytes) -> DoneJob:
 
 
 def _reason(error: object) -> str:
-    """The first sentence of an error of Ray, whose texts are long."""
+    """Return the first sentence of an error of Ray, because its messages are long."""
     return one_line(str(error)).partition(". ")[0]

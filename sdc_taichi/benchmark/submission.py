@@ -1,8 +1,8 @@
-"""Rows that other people have run, which are checked and join the results of a suite.
+"""Submissions: results of other people, which are checked and added to the results of a suite.
 
-The folder is laid out as that of a study, with ``submission.json`` beside it, which names the
-author. The checks are of schema and completeness: figures that were made up with care pass them, so
-``rerun`` runs submitted policies again and compares the figures.
+A submission has the folder structure of a study, with an additional file ``submission.json`` that
+names the author. The checks cover schema and completeness only, and cannot detect invented results.
+``rerun`` therefore repeats the runs of submitted policies and compares the results.
 """
 
 from __future__ import annotations
@@ -49,35 +49,35 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ROW_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,79}")
-"""Valid name of a row."""
+"""Pattern of a valid row name."""
 _SAME = 1e-3
-"""Largest relative difference of figures that are run again: policies magnify the last bits, which
-differ between processors."""
+"""Maximum relative difference between submitted and repeated results. Rounding differs between
+processors, and policies amplify it."""
 _NEEDED = ("figure", "idle_figure", "cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "water_l")
 
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """A row as its folder holds it."""
+    """A submitted row (controller or trained policy) with its results."""
 
     store: ResultStore
-    """The folder."""
+    """Folder of the submission."""
     about: SubmissionRecord
-    """Content of submission.json."""
+    """Content of ``submission.json``."""
     suite: str
     """Name of the suite."""
     row: str
     """Name of the row."""
     results: tuple[RowResult, ...]
-    """Its results by case and seed."""
+    """Result of each case and seed."""
 
     def of_case(self, name: str) -> list[RowResult]:
-        """Results of one case."""
+        """Return the results of one case."""
         return [x for x in self.results if x.record.partition["case"] == name]
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """Names of the cases that it has results of."""
+        """Names of the cases for which the submission has results."""
         return tuple(dict.fromkeys(x.record.partition["case"] for x in self.results))
 
 
@@ -88,8 +88,8 @@ def read_submission(folder: Path) -> Submission:
         folder: the folder.
 
     Raises:
-        SdcError: files are missing, damaged, of another format or of another version of the
-            package, or belong to several rows.
+        SdcError: files are missing or damaged, have a different format or version of the package,
+            or belong to several rows.
     """
     store = ResultStore(folder)
     about = read_record(folder / SUBMISSION_FILE, SubmissionRecord)
@@ -112,15 +112,15 @@ def read_submission(folder: Path) -> Submission:
 
 
 def check_submission(submission: Submission, suite: SuiteResults) -> None:
-    """Check that a row belongs to a suite and is complete.
+    """Check that a submitted row belongs to a suite and is complete.
 
     Args:
-        submission: the row.
-        suite: results of the suite that the row is to join.
+        submission: the submitted row.
+        suite: results of the suite to which the row shall be added.
 
     Raises:
-        ConfigError: the name is taken or not valid, the suite or case is another, or seeds, weeks
-            or figures are missing.
+        ConfigError: the name exists already or is not valid, the suite or a case differs, or seeds,
+            weeks or values are missing.
     """
     place, row = submission.store.folder, submission.row
     if submission.suite != suite.name:
@@ -144,14 +144,15 @@ def check_submission(submission: Submission, suite: SuiteResults) -> None:
 
 
 def add_submission(folder: Path, to: Path) -> Submission:
-    """Check a row and copy it into the results of a suite.
+    """Check a submitted row and copy it into the results of a suite.
 
     Args:
-        folder: folder with the results of the row.
-        to: folder of the study of the suite.
+        folder: folder of the submission.
+        to: folder of the study with the suite's results.
 
     Raises:
-        SdcError: the row is not valid, another process uses ``to``, or it cannot be written.
+        SdcError: the submission is not valid, another process uses ``to``, or ``to`` is not
+            writable.
     """
     submission, target = read_submission(folder), ResultStore(to)
     (suite,) = read_suites([to])
@@ -162,7 +163,7 @@ def add_submission(folder: Path, to: Path) -> Submission:
         for result in submission.results:
             record, store = result.record, submission.store
             files = {name: store.file(record.partition, name) for name in record.files_sha256}
-            # Written first, so that a row never appears without its author.
+            # Write the author first, so that a result never exists without it.
             about = target.folder_of(record.partition).parent / SUBMISSION_FILE
             write_record(about, submission.about)
             target.write(record, store.rows_file(record), files)
@@ -184,51 +185,51 @@ def write_submission(
     link: str = "",
     files: Mapping[int, Mapping[str, bytes]] | None = None,
 ) -> None:
-    """Write the folder of a row that was not run by this package, to be added to a suite.
+    """Write a submission folder with results that were computed without this package.
 
     Args:
         out: the folder.
-        frames: rows of each seed, one for each data-center week in the order of the suite, with the
-            columns of the suite's rows.
+        frames: table of results for each seed, with one line for each data-center week in the order
+            of the suite, and the columns of the suite's results.
         suite: name of the suite.
         case: name of the case.
-        row: name of the row.
-        kind: ``learner``, which has all seeds of the suite, or ``controller``.
+        row: name of the submitted row.
+        kind: ``learner`` for a trained method with all seeds of the suite, or ``controller``.
         author: name of the author.
-        about: description of the row in a sentence.
-        link: address of more information.
-        files: further files of each seed by their paths, such as a policy.
+        about: description of the row in one sentence.
+        link: web address with more information.
+        files: content of further files by path for each seed, such as a policy.
 
     Raises:
-        SdcError: a name that is not valid, or a file that cannot be written.
+        SdcError: a name is not valid, or a file cannot be written.
     """
     record = SubmissionRecord(author=author, about=about, link=link, kind=kind)
     write_record(out / SUBMISSION_FILE, record)
     store = ResultStore(out)
     for seed, frame in frames.items():
         partition = dict(zip(COLUMNS, (suite, case, row, str(seed)), strict=True))
-        of_seed = dict((files or {}).get(seed, {}))
-        for name in of_seed:
+        seed_files = dict((files or {}).get(seed, {}))
+        for name in seed_files:
             check_file_name(name)
         job = Job("", {"name": row, "seed": seed}, partition)
-        store.keep(DoneJob(job, rows=parquet(frame), files=of_seed))
+        store.keep(DoneJob(job, rows=parquet(frame), files=seed_files))
 
 
 def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | None = None) -> float:
-    """Run the policies of a row again in some weeks of each site, and compare the figures.
+    """Repeat the runs of submitted policies in some weeks of each site, and compare the results.
 
     Args:
-        submission: the row.
-        to: folder of the study of its suite.
-        weeks: number of weeks of each site, 1 or more and no more than the case has.
+        submission: the submitted row.
+        to: folder of the study with the suite's results.
+        weeks: number of weeks per site, at least 1 and at most the number of the case.
         progress: progress callback ``(stage, done, total)``; counts results.
 
     Returns:
-        Largest relative difference of the figure of a week.
+        Maximum relative difference of a week's objective.
 
     Raises:
-        SdcError: no policies, policies that do not fit, too many weeks, or figures that the
-            policies do not reach.
+        SdcError: the submission has no policies, a policy does not fit, there are too few weeks in
+            the case, or the policies do not reproduce the submitted results.
     """
     (suite,) = read_suites([to])
     check_submission(submission, suite)
@@ -242,7 +243,7 @@ def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | Non
 
 
 def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
-    """Largest relative difference of the figures of one result in some weeks of each site."""
+    """Repeat one result in some weeks of each site; return the maximum relative difference."""
     settings, count = case.settings, len(case.settings.weeks)
     if weeks > count:
         raise ConfigError(f"verify {weeks}: case {case.name} has {count} weeks; valid are no more")
@@ -272,10 +273,10 @@ def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
 
 
 def _submitted_policy(result: RowResult, fleet: Fleet) -> Controller:
-    """The policy of a result as a controller, or one policy for each agent.
+    """Return a controller that runs the submitted policy, or one policy for each agent.
 
     Raises:
-        SdcError: the result has no policy, or one that does not fit.
+        SdcError: the result has no policy, or the policy does not fit the data centers.
     """
     loaded: dict[str, Controller] = {
         name: PolicyController(Policy.load(folder), fleet, str(folder))
@@ -288,15 +289,15 @@ def _submitted_policy(result: RowResult, fleet: Fleet) -> Controller:
 
 
 def _check_case(submission: Submission, seeds: int, case: CaseResults) -> None:
-    """Check that seeds, weeks and figures of a case are complete and of the same data centers.
+    """Check that seeds, weeks and values of a case are complete and of the same data centers.
 
     Raises:
-        ConfigError: naming the place and what would be valid.
+        ConfigError: the check failed; the message names the place and what would be valid.
     """
     results = submission.of_case(case.name)
     place = f"{submission.store.folder}: case {case.name}"
     rows = [x for name, x in case.rows.items() if case.kinds[name] not in (ACHIEVED, BOUND)]
-    # Where events are sampled, idle commands reach other figures with each seed.
+    # If events are sampled, the objective of idle commands depends on the seed.
     needed = len(max(rows, key=len, default=())) if _idle_differs(rows) else 1
     needed = max(needed, seeds) if submission.about.kind == LEARNER else needed
     if sorted(x.seed for x in results) != list(range(needed)):
@@ -313,7 +314,7 @@ def _check_case(submission: Submission, seeds: int, case: CaseResults) -> None:
 
 
 def _idle_differs(rows: Sequence[Sequence[RowResult]]) -> bool:
-    """Whether figures of idle commands differ between the seeds of a row."""
+    """Return True if the objective of idle commands differs between the seeds of a row."""
     return any(
         not np.array_equal(x.frame["idle_figure"], results[0].frame["idle_figure"])
         for results in rows
