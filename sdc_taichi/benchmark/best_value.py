@@ -1,4 +1,4 @@
-"""The best value of a field by month, beside the best fixed one and that of the config."""
+"""Best value of a swept field in each month, compared with fixed values of the field."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ALL_MONTHS = "all"
-"""Month of the row of all months together."""
+"""Value of column ``month`` in the row of all months together."""
 
 
 def chosen_grid(sweep: Sweep) -> Grid:
-    """The field whose best value is looked for: the first grid of two or more numbers.
+    """Return the field whose best value is searched: the first list of two or more numbers.
 
     Raises:
         ConfigError: the sweep has no months, or no such field.
@@ -35,10 +35,12 @@ def chosen_grid(sweep: Sweep) -> Grid:
 
 
 def with_default(sweep: Sweep) -> Sweep:
-    """A sweep whose chosen field also takes the value of the config, if that is a number.
+    """Return the sweep with the configuration's own value added to the chosen field's values.
+
+    The sweep is unchanged if the configuration's value of the field is not a number.
 
     Raises:
-        ConfigError: no field can be chosen.
+        ConfigError: the sweep has no months, or no field with two or more numbers.
     """
     grid, default = chosen_grid(sweep), value_at(sweep.config, chosen_grid(sweep).field)
     if not isinstance(default, int | float) or isinstance(default, bool):
@@ -48,27 +50,28 @@ def with_default(sweep: Sweep) -> Sweep:
 
 
 def group_columns(sweep: Sweep) -> list[str]:
-    """Columns that define a group of rows: controller, and the other varied fields or else site."""
+    """Return the columns that define a group: controller, and the other varied fields or site."""
     others = [field for field in sweep.fields if field != chosen_grid(sweep).field]
     return ["controller", *(others or ["site"])]
 
 
 def best_by_month(rows: pd.DataFrame, sweep: Sweep, metric: str) -> pd.DataFrame:
-    """The value of least metric in each month, beside fixed values.
+    """Find the value with the lowest metric in each month, and compare it with fixed values.
 
-    The best fixed value is the one of least sum over all months that are run. A value that lacks a
-    month is none, as one that is not valid. Of equal values the first in order counts.
+    The best fixed value has the lowest sum of the metric over all months. Values without results in
+    all months are ignored. If several values are equally good, the first is used.
 
     Args:
-        rows: rows of the sweep.
+        rows: result rows of the sweep.
         sweep: the sweep.
-        metric: a column of the rows, of which less is better.
+        metric: column of the rows to minimise.
 
     Returns:
-        For each group a row for each month and one, ``ALL_MONTHS``, with the means over the months.
-        Columns are those of ``group_columns`` and ``month``; ``best``, ``fixed`` and ``default``,
-        the last the value of the config, with the metric there, such as ``best_cfp_kg``; and
-        ``below_fixed_pct`` and ``below_default_pct``, by how much the best is below them, in %.
+        Table with a row for each group and month, and a row ``ALL_MONTHS`` with the means over the
+        months for each group. Besides ``group_columns`` and ``month``, it has the columns ``best``
+        (best value of the month), ``fixed`` (best fixed value) and ``default`` (value of the
+        configuration), each with its metric, such as ``best_cfp_kg``. ``below_fixed_pct`` and
+        ``below_default_pct`` are the savings of the best value, in %.
     """
     import pandas as pd
 
@@ -87,15 +90,15 @@ def best_by_month(rows: pd.DataFrame, sweep: Sweep, metric: str) -> pd.DataFrame
 def figures_by_month(
     rows: pd.DataFrame, sweep: Sweep, metric: str
 ) -> list[tuple[str, list[int], F64, F64]]:
-    """Figures for pictures: name of each group, its months, its values and the metric there.
+    """Return the data for plots of a metric against month and value of the chosen field.
 
     Args:
-        rows: rows of the sweep.
+        rows: result rows of the sweep.
         sweep: the sweep.
-        metric: a column of the rows.
+        metric: column of the rows.
 
     Returns:
-        For each group its name, M months, V values, (V,), and the metric, (M, V).
+        For each group its name, its M months, its V values, (V,), and the metric, (M, V).
     """
     panels = []
     for names, group in _groups(rows, sweep):
@@ -107,14 +110,14 @@ def figures_by_month(
 
 
 def _groups(rows: pd.DataFrame, sweep: Sweep) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
-    """Values of ``group_columns`` and rows of each group, in the order of the rows."""
+    """Yield the values of ``group_columns`` and the rows of each group, in row order."""
     columns = group_columns(sweep)
     for names, group in rows.groupby(columns, sort=False, dropna=False, observed=True):
         yield tuple(names), group
 
 
 def _table(rows: pd.DataFrame, sweep: Sweep, metric: str) -> tuple[list[int], F64, F64]:
-    """Months of some rows, values that have all of them, and the metric of each, (M, V)."""
+    """Return the months, the values with results in all months, and the metric, (M, V)."""
     wide = rows.pivot_table(
         index="month", columns=chosen_grid(sweep).field, values=metric, dropna=False
     )
@@ -125,7 +128,7 @@ def _table(rows: pd.DataFrame, sweep: Sweep, metric: str) -> tuple[list[int], F6
 def _months(
     months: Sequence[int], values: F64, figures: F64, default: Any, metric: str
 ) -> pd.DataFrame:
-    """Rows of a group: of each month, and of all months together."""
+    """Return the result rows of a group: one for each month, and one for all months together."""
     import pandas as pd
 
     each = np.arange(len(months))

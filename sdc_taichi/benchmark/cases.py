@@ -1,4 +1,4 @@
-"""Cases of suites as data centers, settings of trainings, seeds and controllers."""
+"""Conversion of suite cases and rows to data centers, training settings and seeds."""
 
 from __future__ import annotations
 
@@ -19,33 +19,34 @@ from sdc_taichi.learning.training_settings import (
 from sdc_taichi.sim.fleet import build_fleet
 
 _FIXED = ("weeks", "seed", "scenario", "config", "overrides", "sites")
-"""Settings of trainings that a case or seed decides."""
+"""Training settings that the case or the seed determines; a row cannot set them."""
 
 
 def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
-    """Data centers of a part of a case, one for each site.
+    """Return the data centers of a part of a case, one for each site.
 
     Args:
         case: the case.
-        part: held-out data centers, or those of the training.
+        part: ``held-out`` for the data centers of the results, ``validation`` for those of the
+            training.
 
     Raises:
-        ConfigError: a file, value or site that is not valid.
+        ConfigError: a file, value or site is not valid.
     """
     values = _data_center_values(case)
     if part == "held-out":
         changes = case.test.model_dump(exclude_defaults=True)
         values = merged(values, changes)
-    # An algorithm has to be named, and decides nothing here.
+    # The settings require an algorithm, which does not affect the data centers.
     return make_settings({"algorithm": "ippo"} | values, "case").data_centers_of_sites()
 
 
 def weeks_of(case: Case, part: Part) -> tuple[int, ...]:
-    """Weeks of the year, 0..51, of a part of a case.
+    """Return the weeks of the year, 0..51, of a part of a case.
 
     Args:
         case: the case.
-        part: the part.
+        part: ``held-out`` or ``validation``.
     """
     return case.weeks if part == "held-out" else case.validation_weeks
 
@@ -59,18 +60,18 @@ def training_settings(
     training: Mapping[str, Any],
     agent: str | None = None,
 ) -> TrainingSettings:
-    """Settings of the training of a row in a case.
+    """Return the settings for the training of a row in a case.
 
     Args:
         case: the case.
-        row: the row, which is one that learns.
+        row: the row, whose ``train`` is set.
         objective: objective of the suite, by which the best policy is chosen.
         seed: seed of the training.
         training: settings of all trainings of the suite.
-        agent: agent that alone learns, the others idle; None is all that the row says.
+        agent: the only agent that learns, with idle others; None selects the agents of the row.
 
     Raises:
-        ConfigError: settings that are not valid, or that the case decides.
+        ConfigError: a setting is not valid, or is determined by the case.
     """
     settings = merged(training, row.train or {})
     for name in _FIXED:
@@ -94,7 +95,7 @@ def training_settings(
 
 
 def training_steps(training: Mapping[str, Any], train: Mapping[str, Any]) -> int:
-    """Steps of a training, of all data centers together.
+    """Return the number of steps of a training, summed over all data centers.
 
     Args:
         training: settings of all trainings of the suite.
@@ -106,7 +107,7 @@ def training_steps(training: Mapping[str, Any], train: Mapping[str, Any]) -> int
 
 
 def agents_of(settings: TrainingSettings) -> tuple[str, ...]:
-    """Agents that learn in a training.
+    """Return the names of the agents that learn in a training.
 
     Args:
         settings: settings of the training.
@@ -115,7 +116,7 @@ def agents_of(settings: TrainingSettings) -> tuple[str, ...]:
 
 
 def number_of_seeds(suite: Suite, case: str, row: str) -> int:
-    """Number of seeds of a row in a case: that of the suite where anything is random, and else 1.
+    """Return the number of seeds of a row in a case; 1 if neither row nor case is random.
 
     Args:
         suite: the suite.
@@ -130,13 +131,13 @@ def number_of_seeds(suite: Suite, case: str, row: str) -> int:
 
 
 def check_suite(suite: Suite) -> None:
-    """Find what is wrong with a suite before any work is done.
+    """Check a suite completely before any job runs.
 
     Args:
         suite: the suite.
 
     Raises:
-        ConfigError: data centers, controllers or settings of trainings that are not valid, naming
+        ConfigError: data centers, controllers or training settings are not valid; the message names
             the case and the row.
     """
     for name, case in suite.cases.items():
@@ -167,6 +168,6 @@ def check_suite(suite: Suite) -> None:
 
 
 def _data_center_values(case: Case) -> dict[str, Any]:
-    """Settings of trainings that say which data centers and options they are of."""
+    """Return the values of a case that are also training settings: data centers and options."""
     names = {"scenario", "config", "overrides", "sites", "environment"}
     return case.model_dump(include=names, exclude_defaults=True)

@@ -1,4 +1,4 @@
-"""A data set for offline learning: returns of its controllers, and its card in Markdown."""
+"""Description of a data set for offline learning: returns of its controllers, and data card."""
 
 from __future__ import annotations
 
@@ -59,31 +59,32 @@ rows) and `infos/NAME` (T + 1, the first 0), and the attributes `controller`, `w
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """A data set that has been written."""
+    """Data set for offline learning that was written to a folder."""
 
     id: str
-    """Name in Minari: folders, name and version, such as ``sdc_taichi/corrected-ny-v0``."""
+    """Name in Minari, with namespace and version, such as ``sdc_taichi/corrected-ny-v0``."""
     folder: Path
-    """Folder with its card and the folder ``data``."""
+    """Folder with the data card and the subfolder ``data``."""
     collection: Collection
-    """Episodes that the data set holds."""
+    """Definition of the episodes in the data set."""
     returns: pd.DataFrame
-    """A row for each controller, that of idle commands first even where it is not in the data set,
-    with ``episodes``, ``steps``, ``mean_return``, ``changed_commands`` (share of the commands that
-    the nearest action changes) and the sum of each quantity of infos."""
+    """Table with a row for each controller, beginning with idle commands, even if these are not in
+    the data set. Its columns are ``episodes``, ``steps``, ``mean_return``, ``changed_commands``
+    (share of commands that the conversion to actions changes), and the sum of each quantity in the
+    infos."""
 
     @property
     def best(self) -> str | None:
-        """The first known optimum that earns more than idle commands, if any."""
+        """Name of the first optimum with a higher return than idle commands; None without one."""
         optima = [name for name in self.collection.controllers if is_optimum(name)]
         return next((name for name in optima if self.mean_return(name) > self.mean_return()), None)
 
     def mean_return(self, controller: str = IDLE) -> float:
-        """Mean of the sum of the rewards of an episode of a controller."""
+        """Return the mean undiscounted return of a controller's episodes."""
         return float(self.returns["mean_return"][controller])
 
     def score(self, controller: str) -> float:
-        """Share of the way from idle commands to the known optimum; nan without one."""
+        """Return the normalised score: 0 for idle commands, 1 for the optimum; nan without it."""
         idle, best = self.mean_return(), self.best
         if best is None:
             return math.nan
@@ -91,23 +92,23 @@ class DataSet:
 
 
 def returns_of(episodes: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """The table ``DataSet.returns`` of the episodes of all controllers.
+    """Return the table ``DataSet.returns`` from the episodes of all controllers.
 
     Args:
-        episodes: figures of each episode, of ``figures_of``.
+        episodes: summary of each episode, from ``figures_of``.
     """
     import pandas as pd
 
-    of_controllers = pd.DataFrame(episodes).groupby("controller", sort=False)
-    table = of_controllers.sum()
-    table["episodes"] = of_controllers.size()
+    by_controller = pd.DataFrame(episodes).groupby("controller", sort=False)
+    table = by_controller.sum()
+    table["episodes"] = by_controller.size()
     for name in ("mean_return", "changed_commands"):
         table[name] /= table["episodes"]
     return table
 
 
 def figures_of(episode: Episode) -> dict[str, Any]:
-    """Controller, return, number of steps and sums of an episode.
+    """Return controller, return, number of steps and summed quantities of an episode.
 
     Args:
         episode: the episode.
@@ -122,16 +123,16 @@ def figures_of(episode: Episode) -> dict[str, Any]:
 
 
 def is_optimum(controller: str) -> bool:
-    """Whether a controller replays the commands of a known optimum."""
+    """Return True if a name is ``optimum`` or ``optimum:OBJECTIVE``."""
     return objective_of_optimum(controller) is not None
 
 
 def card(made: DataSet, command: str) -> str:
-    """The card of a data set as Markdown.
+    """Return the data card of a data set as Markdown.
 
     Args:
         made: the data set.
-        command: command line that makes it again; empty if there is none.
+        command: command line that reproduces the data set; empty if there is none.
     """
     with closing(made.collection.make_batch(1)) as env:
         parts = [
@@ -164,14 +165,14 @@ def card(made: DataSet, command: str) -> str:
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table in Markdown."""
+    """Return a table as Markdown."""
     import pandas as pd
 
     return markdown(pd.DataFrame(rows, columns=list(titles)))
 
 
 def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, Any]]:
-    """Names and values of facts about a data set."""
+    """Return names and values of facts about a data set."""
     collection, rewards = made.collection, env.core.options.rewards
     return [
         ("environment", f"{collection.environment_id}, with all arguments in its spec"),
@@ -190,7 +191,7 @@ def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, Any]]:
 
 
 def _controllers(made: DataSet) -> Iterator[tuple[Any, ...]]:
-    """Rows of the table of controllers, one of idle commands among them."""
+    """Yield the rows of the table of controllers, including idle commands."""
     idle = made.returns.loc[IDLE]
     for name, row in made.returns.iterrows():
         yield (
@@ -208,7 +209,7 @@ def _controllers(made: DataSet) -> Iterator[tuple[Any, ...]]:
 
 
 def _observations(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
-    """Features, in the order of their entries."""
+    """Yield a table row for each feature, in the order of the observation's entries."""
     first = 0
     for each in env.features:
         range_text = f"{each.low:g}..{each.high:g}"
@@ -217,7 +218,7 @@ def _observations(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
 
 
 def _actions(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
-    """Agent and commands of the entries of an action."""
+    """Yield a table row for each agent: its entries of the action, and its commands."""
     first = 0
     for agent in env.core.agents:
         size = int(np.prod(env.core.action_spaces[agent].shape or ()))
@@ -226,12 +227,12 @@ def _actions(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
 
 
 def _entries(first: int, size: int) -> str:
-    """Numbers of adjacent entries of a vector, as text."""
+    """Return the index range of adjacent vector entries as text, such as ``3-5``."""
     return str(first) if size == 1 else f"{first}-{first + size - 1}"
 
 
 def _licence(collection: Collection, env: SdcVectorEnv) -> str:
-    """Text on the data that the episodes are made from."""
+    """Return a paragraph on the input data of the episodes and their licences."""
     drivers = env.core.sim.drivers
     if drivers.synthetic[0] and not input_paths(collection.config):
         return (

@@ -1,7 +1,11 @@
-"""Episodes of controllers in weeks of a data center, as an agent of its environment records them.
+"""Recording of controllers as episodes of an environment, with observations, actions and rewards.
 
-A controller acts on its usual view. Its commands become the nearest actions of an environment,
-which carries these out. So the actions of an episode reproduce it in that environment.
+A controller observes its usual view of the data center. Each of its commands is converted to the
+nearest action of the environment, which is then executed. Repeating the recorded actions in the
+environment therefore reproduces the episode.
+
+In shapes, B is the number of environments, T the number of steps, n the number of entries of an
+observation, and k the number of entries of an action.
 """
 
 from __future__ import annotations
@@ -40,18 +44,19 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, StepResult
 
 IDLE, RANDOM = "idle", "random"
-"""Controller that changes nothing, and the one that draws actions evenly."""
+"""Names of the controller without commands, and of the one with uniformly random actions."""
 QUANTITIES = ("carbon_g", "grid_kwh", "energy_cost")
-"""Quantities of ``StepResult`` in the infos of each step."""
+"""Fields of ``StepResult`` that the infos of each step contain."""
 MOST_REPEATS = 10_000
-"""Largest number of episodes of a week and a controller."""
+"""Maximum number of episodes per week and controller."""
 _SET_ELSEWHERE = {
     **dict.fromkeys(("days", "start", "months"), "valid is to choose weeks and days"),
     "heat_map": "valid is False, as learners take features alone",
 }
-"""Options of environments that are not set here, and what is valid instead."""
+"""Environment options that must not be set in a collection, with the valid alternative."""
 _TOGETHER, _STEPS_TOGETHER = 64, 65_536
-"""Most episodes that run side by side, and most of their steps, which bounds the memory."""
+"""Maximum number of episodes in a batch, and maximum total number of their steps; they limit the
+memory use."""
 _TOLERANCE = 1e-5
 """Commands closer than this count as equal, because actions are stored as f32."""
 
@@ -61,24 +66,24 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Collection:
-    """Episodes to collect: controllers, weeks of one data center, options of its environment."""
+    """Episodes to collect: controllers, weeks of one data center, and environment options."""
 
     config: DataCenterConfig
     """The data center."""
     controllers: tuple[str, ...]
-    """Names of controllers, ``random``, ``optimum`` and ``optimum:OBJECTIVE`` among them."""
+    """Names of controllers; ``random``, ``optimum`` and ``optimum:OBJECTIVE`` are also valid."""
     weeks: tuple[int, ...]
-    """Weeks of the year, 0..51, on whose first days episodes begin."""
+    """Weeks of the year, 0..51; episodes begin on the first day of a week."""
     days: int = DAYS_PER_WEEK
     """Length of an episode, in days, 1..7."""
     repeats: int = 1
-    """Episodes of each controller in each week, with different seeds."""
+    """Number of episodes of each controller in each week, with different seeds."""
     seed: int = 0
-    """Seed of the first episode of week 0; those of other episodes follow from it."""
+    """Seed of the first episode of week 0, from which the seeds of other episodes are derived."""
     agent: str | None = None
-    """The one agent that acts; None is all agents together."""
+    """Name of the agent if only one acts; None lets all agents act together."""
     environment: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the environment, as ``EnvOptions`` has them."""
+    """Options of the environment, with the names of ``EnvOptions``."""
     precision: Precision = "f32"
     """Precision of the server kernels."""
 
@@ -96,21 +101,21 @@ class Collection:
 
     @property
     def environment_id(self) -> str:
-        """Name of the environment in Gymnasium."""
+        """Identifier of the environment in Gymnasium's registry."""
         return next(name for name, agent in IDS.items() if agent == self.agent)
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """Options of the environment, on top of those that agents are trained with."""
+        """Return the options of the environment; the defaults are those of trainings."""
         agents = {} if self.agent is None else {"agents": (self.agent,)}
         beneath = training_environment({**self.environment, **agents})
-        # Agents that learn take small steps of the setpoint, some controllers large ones.
+        # Trainings use small setpoint changes per step, but some controllers make large ones.
         beneath.pop("setpoint_change_k", None)
         return {**beneath, **self.environment, **agents, "days": self.days}
 
     @property
     def starts(self) -> list[Start]:
-        """Beginnings of the episodes of each controller, equal for all."""
+        """Week and seed of each episode; they are the same for all controllers."""
         return [
             Start(week=week, seed=self.seed + WEEKS * repeat + week)
             for repeat in range(self.repeats)
@@ -118,10 +123,10 @@ class Collection:
         ]
 
     def make_env(self) -> gymnasium.Env[Any, Any]:
-        """The environment of one data center, in which every episode can be done again.
+        """Create the environment of one data center, which can reproduce every episode.
 
         Raises:
-            SdcError: options that are not valid.
+            SdcError: an option is not valid.
         """
         config = self.config.model_dump(mode="json")
         return gymnasium.make(
@@ -129,10 +134,10 @@ class Collection:
         )
 
     def make_batch(self, size: int) -> SdcVectorEnv:
-        """Environments of equal data centers that step together.
+        """Create a batch of environments of equal data centers.
 
         Args:
-            size: their number, B.
+            size: number of environments, B.
         """
         return SdcVectorEnv(
             size,
@@ -144,10 +149,10 @@ class Collection:
         )
 
     def check(self) -> None:
-        """Check before any work that all controllers can act in the environment.
+        """Check before any simulation that all controllers can act in the environment.
 
         Raises:
-            SdcError: an option or a controller that is not valid.
+            SdcError: an option or a controller is not valid.
         """
         with closing(self.make_batch(1)) as env:
             for name in self.controllers:
@@ -156,37 +161,38 @@ class Collection:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The beginning of an episode."""
+    """Start of an episode: week and seed."""
 
     week: int
     """Week of the year, 0..51."""
     seed: int
-    """Seed that the environment is reset with."""
+    """Seed for the reset of the environment."""
 
     @property
     def day(self) -> int:
-        """First day, counted from 0 in the year."""
+        """First day of the episode as day of the year, from 0."""
         return DAYS_PER_WEEK * self.week
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """An episode of T steps, with what was observed before each step and after the last."""
+    """Recorded episode of T steps, with observations before each step and after the last step."""
 
     controller: str
     """Name of the controller."""
     start: Start
-    """How it began."""
+    """Week and seed of the episode."""
     observations: F32
     """Observations, (T + 1, n)."""
     actions: npt.NDArray[Any]
-    """Actions, (T, k) numbers within -1..1, or whole numbers, (T, k) or (T,)."""
+    """Actions: continuous, (T, k), within -1..1, or discrete integers, (T, k) or (T,)."""
     rewards: F64
     """Rewards, (T,)."""
     infos: dict[str, F64]
-    """Quantities of each step by name, (T + 1,) each; the first, before any step, are 0."""
+    """Quantities of each step by name, (T + 1,) each; entry 0, before the first step, is 0."""
     changed_commands: float
-    """Share of the commands that the nearest action changes."""
+    """Share of the controller's commands, 0..1, that differ from the executed commands, because the
+    nearest action does not represent them exactly."""
 
 
 def episodes(
@@ -196,20 +202,20 @@ def episodes(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Iterator[Episode]:
-    """Run a controller through all episodes of a collection.
+    """Run a controller in all episodes of a collection.
 
     Args:
-        collection: what is collected.
-        controller: one of its controllers, or another name.
-        progress: progress callback; counts the steps of each batch.
-        stop: called before every step; true ends the run.
+        collection: data center, weeks and options of the episodes.
+        controller: name of a controller, which does not need to belong to the collection.
+        progress: progress callback, which counts the steps of each batch.
+        stop: called before every step; the run ends if it returns true.
 
     Yields:
-        Episodes in the order of ``collection.starts``; a few at a time are in memory.
+        Episodes in the order of ``collection.starts``; only one batch at a time is in memory.
 
     Raises:
-        SdcError: a controller that is not valid, or what it does is not.
-        StoppedError: ``stop`` was true.
+        SdcError: the controller or one of its commands is not valid.
+        StoppedError: ``stop`` returned true.
     """
     starts = collection.starts
     steps = 24 * collection.days * collection.config.simulation.steps_per_hour
@@ -222,12 +228,12 @@ def episodes(
 
 
 class _Commander:
-    """Actions nearest to a controller's commands.
+    """Converter from a controller's commands to the nearest actions of the environments.
 
     Args:
-        controller: gives the commands.
-        env: the environments.
-        decided: commands that actions decide.
+        controller: controller that gives the commands.
+        env: batch of environments.
+        decided: names of the commands that actions determine.
     """
 
     def __init__(self, controller: Controller, env: SdcVectorEnv, decided: tuple[str, ...]) -> None:
@@ -235,41 +241,41 @@ class _Commander:
         self._commands = Actions()
 
     def reset(self, starts: list[Start]) -> None:
-        """Begin an episode of each environment."""
+        """Begin a new episode in each environment."""
         self._controller.reset(self._env.core.view.state.seed)
 
     def act(self) -> npt.NDArray[Any]:
-        """Actions for the step to come, (B,) or (B, k)."""
+        """Return the actions for the next step, (B,) or (B, k)."""
         self._commands = self._controller.act(self._env.core.view)
         return self._env.actions_of(self._commands)
 
     def changed(self, result: Mapping[str, Any]) -> F64:
-        """Share of its last commands that differ from those carried out, (B,).
+        """Return the share of the last commands that differ from the executed commands, (B,).
 
         Args:
             result: quantities of the step, (B,) each.
         """
-        done = [name for name in self._decided if f"{name}_command" in result]
+        executed = [name for name in self._decided if f"{name}_command" in result]
         size = self._env.num_envs
-        out = np.zeros(size)
-        for name in done:
+        changed = np.zeros(size)
+        for name in executed:
             commands = as_numbers(getattr(self._commands, name))
-            of_each = commands.reshape(size if commands.ndim else 1, -1).mean(axis=1)
-            out += np.abs(result[f"{name}_command"] - of_each) > _TOLERANCE
-        return out / max(len(done), 1)
+            means = commands.reshape(size if commands.ndim else 1, -1).mean(axis=1)
+            changed += np.abs(result[f"{name}_command"] - means) > _TOLERANCE
+        return changed / max(len(executed), 1)
 
 
 class FollowedOptimum:
-    """Controller that steers towards the optimum's achieved path of the current episode.
+    """Controller that follows the optimum's achieved path of the current episode.
 
-    Each episode is solved before its first step, unless a cache holds its optimum.
+    The optimum of each episode is computed before its first step, or read from a cache.
 
     Args:
         steps: number of steps of an episode.
         objective: quantity to minimise.
-        agents: agents (load, cooling, battery) that the plan moves; the others are idle.
-        progress: progress callback of solving.
-        stop: called repeatedly while solving; true raises ``StoppedError``.
+        agents: agents (load, cooling, battery) that the optimum controls; the others are idle.
+        progress: progress callback of the optimiser.
+        stop: called repeatedly by the optimiser; if it returns true, ``StoppedError`` is raised.
     """
 
     def __init__(
@@ -286,17 +292,17 @@ class FollowedOptimum:
         self._follower: Follower | None = None
 
     def reset(self, seed: int | I64) -> None:
-        """Begin another episode."""
+        """Begin a new episode."""
         self._follower = None
 
     def act(self, view: View) -> Actions:
-        """Commands for work, setpoint and battery."""
+        """Return the commands for work, setpoint and battery."""
         if self._follower is None:
             self._follower = Follower(view.fleet, view.drivers, view.sizing, self._targets(view))
         return self._follower.actions(view.state)
 
     def _targets(self, view: View) -> Targets:
-        """States that the achieved path passes through."""
+        """Return the states of the achieved path in each step."""
         optimum = solve(
             view.fleet,
             steps=self._steps,
@@ -320,10 +326,10 @@ class FollowedOptimum:
 
 
 def objective_of_optimum(name: str) -> Objective | None:
-    """Objective of ``optimum`` or ``optimum:OBJECTIVE``; None for the name of a controller.
+    """Return the objective in ``optimum`` or ``optimum:OBJECTIVE``; None for other names.
 
     Raises:
-        ConfigError: an objective that is not valid.
+        ConfigError: the objective is not valid.
     """
     kind, colon, objective = name.partition(":")
     if kind != OPTIMUM:
@@ -332,28 +338,28 @@ def objective_of_optimum(name: str) -> Objective | None:
 
 
 class _Chance:
-    """Actions drawn evenly from the action space, by a generator for each environment.
+    """Uniformly random actions, from a separate random generator for each environment.
 
     Args:
-        env: the environments.
+        env: batch of environments.
     """
 
     def __init__(self, env: SdcVectorEnv) -> None:
         self._spaces = [deepcopy(env.single_action_space) for _ in range(env.num_envs)]
 
     def reset(self, starts: list[Start]) -> None:
-        """Begin an episode of each environment."""
+        """Begin a new episode in each environment."""
         for space, start in zip(self._spaces, starts, strict=True):
-            # Differs from the seed of the environment, which draws its events.
+            # The environment uses its seed for sampled events, so actions need a different seed.
             (seed,) = np.random.SeedSequence([start.seed, 1]).generate_state(1)
             space.seed(int(seed))
 
     def act(self) -> npt.NDArray[Any]:
-        """Actions for the step to come, (B,) or (B, k)."""
+        """Return the actions for the next step, (B,) or (B, k)."""
         return np.stack([space.sample() for space in self._spaces])
 
     def changed(self, result: Mapping[str, Any]) -> F64:
-        """Always 0, because no command precedes its actions, (B,)."""
+        """Return zeros, (B,), because random actions are not derived from commands."""
         return np.zeros(len(self._spaces))
 
 
@@ -364,7 +370,7 @@ def _make_actor(
     progress: Progress | None,
     stop: Callable[[], bool] | None,
 ) -> _Commander | _Chance:
-    """The source of actions in environments, by the name of a controller."""
+    """Create the object that chooses the actions, by the name of a controller."""
     if name == RANDOM:
         return _Chance(env)
     options = env.core.options
@@ -397,7 +403,7 @@ def _run(
     progress: Progress | None,
     stop: Callable[[], bool] | None,
 ) -> Iterator[Episode]:
-    """Run an episode of each environment."""
+    """Run one episode in each environment, and yield the episodes."""
     size, steps = env.num_envs, env.core.steps
     first: Any = env.reset(
         seed=[start.seed for start in starts],
@@ -420,8 +426,8 @@ def _run(
         changed += actor.changed(info) / steps
         for quantity in info:
             if quantity in QUANTITIES or quantity.startswith("cost"):
-                of_steps = infos.setdefault(quantity, np.zeros((size, steps + 1)))
-                of_steps[:, step + 1] = info[quantity]
+                values = infos.setdefault(quantity, np.zeros((size, steps + 1)))
+                values[:, step + 1] = info[quantity]
         if progress is not None:
             progress(name, step + 1, steps)
     for i, start in enumerate(starts):

@@ -1,4 +1,4 @@
-"""Jobs: pieces of work that depend on their values and inputs alone and run in any process."""
+"""Jobs: pieces of work that depend only on their values and inputs, and run in any process."""
 
 from __future__ import annotations
 
@@ -29,98 +29,98 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Inputs = Mapping[str, bytes]
-"""Content of large inputs by name; each worker process receives it once, not with every job."""
+"""Content of large inputs by name; a worker process receives it once, not with every job."""
 FILE_FIELDS = (
     "site.weather_file",
     "site.carbon_file",
     "site.workload_file",
     "hall.recirculation.matrix_file",
 )
-"""Fields of the configuration that name files, whose content decides results."""
+"""Configuration fields that contain the paths of input files."""
 MOST_INPUT_BYTES = 2**28
-"""Largest input file that is read, in bytes."""
+"""Maximum size of an input file, in bytes."""
 _SOURCE_FOLDERS = ("", "configs", "data", "kernels", "viz")
 _SOURCE_SUFFIXES = (".py", ".yaml", ".csv", ".json")
 
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work, whose result is decided by its function, its values and its inputs."""
+    """A piece of work; function, values and inputs determine its result."""
 
     function: str
-    """Import path ``module:name`` of a function of the values and the inputs that returns a
+    """Import path ``module:name`` of a function that takes the values and the inputs, and returns a
     ``JobResult``."""
     values: Mapping[str, Any]
-    """Arguments of the function, as JSON can hold them."""
+    """Arguments of the function; they can be written as JSON."""
     partition: Mapping[str, str]
-    """Columns and values that name the result, such as suite, case, row and seed, in their order;
-    no two jobs of a study have equal ones."""
+    """Identification of the result by columns and values, such as suite, case, row and seed. It is
+    unique within a study."""
     inputs: Mapping[str, str] = field(default_factory=dict)
     """Identity of each input that the function reads, by name: the digest of its content, or the
-    key of the job that makes it."""
+    key of the job that creates it."""
 
     @property
     def name(self) -> str:
-        """The values of the partition as a path, such as ``carbon/eight-sites/ippo/0``."""
+        """Values of the partition as a path, such as ``carbon/eight-sites/ippo/0``."""
         return "/".join(self.partition.values())
 
     @cached_property
     def key(self) -> str:
-        """Digest of all that decides the result, the version of the package included."""
+        """Digest of everything that determines the result, including the package version."""
         content = [self.function, self.values, self.inputs, version("sdc-taichi")]
         return digest_of(json.dumps(content, sort_keys=True).encode())
 
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """Rows, figures and files of a job, equal to the bit on all processors of one kind."""
+    """Table rows, metrics and files of a job; bit-identical on processors of the same kind."""
 
     rows: pd.DataFrame | None
-    """Rows of the dataset; reading the dataset adds the columns of the partition. None if the job
-    has no rows."""
+    """Table rows of the job without the partition, whose columns are added when the rows of a study
+    are read. None if the job has no rows."""
     metrics: Mapping[str, Any]
-    """Figures of the job as a whole; NaN and infinite ones become null in JSON."""
+    """Metrics of the job as a whole; NaN and infinite values become null in JSON."""
     files: Mapping[str, bytes] = field(default_factory=dict)
-    """Content of further files by their path below the folder of the job, such as a policy."""
+    """Content of further files, such as a policy, by path relative to the job's folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class DoneJob:
-    """A job that has ended, successfully or not, with its result as it is written to files."""
+    """A job that has ended, successfully or not, with its result in serialised form."""
 
     job: Job
     """The job."""
     error: str = ""
-    """Error of a job that failed, in one line; empty otherwise."""
+    """Error message of a failed job, in one line; empty after success."""
     rows: bytes = b""
-    """Rows of the dataset as a Parquet file; empty if there are none."""
+    """Content of a Parquet file with the table rows; empty if the job has no rows."""
     metrics: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of the job as a whole, as JSON can hold them."""
+    """Metrics of the job as a whole; they can be written as JSON."""
     files: Mapping[str, bytes] = field(default_factory=dict)
-    """Content of further files by their path below the folder of the job."""
+    """Content of further files by path relative to the job's folder."""
     warnings: tuple[str, ...] = ()
-    """Warnings of the package while the job ran, each in one line."""
+    """Warnings that the package issued during the job, each in one line."""
     core_s: float = 0.0
-    """Processor time that the job took, in s."""
+    """Processor time of the job, in s."""
     source: str = ""
-    """Digest of the source files of the package where the job ran."""
+    """Digest of the package's source files in the process that ran the job."""
     processor: Mapping[str, str] = field(default_factory=dict)
-    """Features of the processor and the libraries on which the last bits of the result depend."""
+    """Properties of processor and libraries that affect the last bits of the result."""
 
 
 def digest_of(content: bytes) -> str:
-    """Digest of the content of an input or file, as hexadecimal SHA-256."""
+    """Return the SHA-256 digest of the content of an input or file, in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
 @cache
 def compute_in_one_thread() -> None:
-    """Limit this process to one thread of computation."""
+    """Limit numerical libraries and kernels in this process to one thread."""
     import threadpoolctl
 
     names = ("SDC_TAICHI_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     os.environ |= dict.fromkeys(names, "1")
-    threadpoolctl.threadpool_limits(1)  # for libraries that are loaded already
+    threadpoolctl.threadpool_limits(1)  # for libraries that have read the variables before
 
 
 def run_job(job: Job, inputs: Inputs) -> DoneJob:
@@ -128,11 +128,11 @@ def run_job(job: Job, inputs: Inputs) -> DoneJob:
 
     Args:
         job: the job.
-        inputs: content of at least the inputs that the job reads.
+        inputs: content of inputs by name, including all inputs that the job reads.
 
     Returns:
-        The job with its result, or with its error in one line. An error that does not belong to
-        the package is reported with its class and place.
+        The job with its result, or with an error message in one line. For errors other than
+        ``SdcError``, the message includes the class and the place in the source.
     """
     from sdc_taichi.run.description import processor_features
 
@@ -165,10 +165,10 @@ def run_job(job: Job, inputs: Inputs) -> DoneJob:
 
 
 def check_file_name(name: str) -> None:
-    """Check the path of a file below the folder of a job.
+    """Check that a relative path is valid for a file in a job's folder.
 
     Raises:
-        SdcError: the path is empty or hidden, leaves the folder, or is the one of the metrics.
+        SdcError: the path is empty or hidden, leaves the folder, or is that of the metrics file.
     """
     parts = PurePosixPath(name).parts
     wrong = not parts or name.startswith("/") or "\\" in name or "\0" in name
@@ -180,7 +180,7 @@ def check_file_name(name: str) -> None:
 
 
 def input_paths(config: DataCenterConfig) -> list[str]:
-    """Paths of the files that a configuration names, each once.
+    """Return the paths of all input files in a configuration, without duplicates.
 
     Args:
         config: the configuration.
@@ -190,22 +190,23 @@ def input_paths(config: DataCenterConfig) -> list[str]:
 
 
 def read_input(path: str) -> bytes:
-    """Content of an input file.
+    """Read an input file.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Raises:
-        SdcError: it cannot be read, or is too large.
+        SdcError: the file cannot be read, or is too large.
     """
     return read_bytes(path, MOST_INPUT_BYTES)
 
 
 @cache
 def source_digest() -> str:
-    """SHA-256 of names and content of the package's source files, equal wherever it is installed.
+    """Return the SHA-256 digest of the names and contents of the package's source files.
 
-    A result keeps it beside the version, because many states of the source share a version.
+    The digest does not depend on the installation folder. Results record it in addition to the
+    package version, because the source can change without a new version.
     """
     paths: dict[str, Path] = {}
     for folder in _SOURCE_FOLDERS:
@@ -223,10 +224,10 @@ def source_digest() -> str:
 
 
 def _packed(result: JobResult, job: Job) -> dict[str, Any]:
-    """The fields of ``DoneJob`` that hold a result.
+    """Serialise a result; return it as fields of ``DoneJob``.
 
     Raises:
-        SdcError: rows with columns of the partition, or files with paths that are not valid.
+        SdcError: the rows contain columns of the partition, or the path of a file is not valid.
     """
     for name in result.files:
         check_file_name(name)
@@ -242,10 +243,10 @@ def _packed(result: JobResult, job: Job) -> dict[str, Any]:
 
 
 def parquet(rows: pd.DataFrame) -> bytes:
-    """Content of a Parquet file of rows, which does not depend on the version of pandas.
+    """Return table rows as the content of a Parquet file, independent of the version of pandas.
 
     Args:
-        rows: the rows.
+        rows: the table rows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -257,7 +258,7 @@ def parquet(rows: pd.DataFrame) -> bytes:
 
 
 def _unexpected(error: Exception) -> str:
-    """An error of another library, with its class and place, in one line."""
+    """Return the message, class and place of an error of another library, in one line."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "unknown"
     return one_line(f"{type(error).__name__}: {error} (unexpected, at {place})")

@@ -1,4 +1,4 @@
-"""Data sets for offline learning: episodes of controllers in Minari's format, each with a card."""
+"""Data sets for offline learning: episodes of controllers in Minari's format, with a data card."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from sdc_taichi.benchmark.episodes import IDLE, Collection, Episode, Progress, e
 from sdc_taichi.errors import ConfigError, SdcError
 
 CARD_FILE = "README.md"
-"""Name of the card, which lies beside the folder ``data`` that Minari reads."""
+"""File name of the data card, in the same folder as the subfolder ``data`` that Minari reads."""
 _DATA = "data"
 _SPARE = 2.0
-"""Space to have before an episode is written, over the size of its arrays."""
+"""Required free disk space before an episode is written, as a multiple of its array size."""
 _ID = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*-v[0-9]+")
 
 
 def require_minari() -> None:
-    """Make sure that Minari and its HDF5 storage are there.
+    """Check that Minari and its HDF5 storage are installed.
 
     Raises:
-        ConfigError: they are not installed.
+        ConfigError: Minari or its HDF5 storage is not installed.
     """
     try:
         import h5py  # noqa: F401
@@ -43,15 +43,15 @@ def require_minari() -> None:
 
 
 def data_set_folder(root: Path, data_set: str, *, replace: bool = False) -> Path:
-    """Folder of a data set below the folder of all, where Minari looks for it.
+    """Return the folder in which Minari looks for a data set.
 
     Args:
         root: folder of all data sets, as in ``MINARI_DATASETS_PATH``.
-        data_set: its name in Minari.
-        replace: whether one that is there may be replaced.
+        data_set: name of the data set in Minari.
+        replace: True if an existing data set may be replaced.
 
     Raises:
-        ConfigError: a name that is not valid, or a folder that is taken.
+        ConfigError: the name is not valid, or the folder already exists.
     """
     if not _ID.fullmatch(data_set):
         raise ConfigError(
@@ -77,23 +77,23 @@ def write_data_set(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> DataSet:
-    """Collect episodes and write them as a data set of Minari.
+    """Collect episodes and write them as a Minari data set.
 
-    It appears under its name once it is whole. Idle commands are run too, as the lower end of
-    normalised scores; the upper end is the known optimum, where it is one of the controllers.
+    The data set appears under its name only after it is complete. Idle commands are also run, as
+    score 0 of normalised scores; score 1 is the optimum, if it is one of the controllers.
 
     Args:
-        collection: what is collected.
+        collection: episodes to collect.
         root: folder of all data sets.
-        data_set: name in Minari.
-        command: command line that makes it again, for the card.
-        replace: whether a data set of that name is replaced.
+        data_set: name of the data set in Minari.
+        command: command line that reproduces the data set, for the data card.
+        replace: True to replace an existing data set with this name.
         progress: progress callback ``(stage, done, total)``.
-        stop: called before every step; true ends the work.
+        stop: called before every step; if it returns true, ``StoppedError`` is raised.
 
     Raises:
-        SdcError: Minari is missing, something is not valid, or a file cannot be written.
-        StoppedError: ``stop`` was true; nothing is kept.
+        SdcError: Minari is missing, a name or an option is not valid, or a file cannot be written.
+        StoppedError: ``stop`` returned true; no data set is written.
     """
     require_minari()
     folder = data_set_folder(root, data_set, replace=replace)
@@ -114,10 +114,10 @@ def write_data_set(
 
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder that gets the name of ``folder`` if the block ends without an error.
+    """Yield a hidden temporary folder, which is renamed to ``folder`` after a block without error.
 
     Raises:
-        SdcError: it cannot be written, or another process writes it.
+        SdcError: the folder is not writable, or another process writes to it.
     """
     with naming_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +125,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     try:
         with naming_errors(folder):
-            # Left by a process that was killed.
+            # A killed process may have left an unfinished folder.
             shutil.rmtree(unfinished, ignore_errors=True)
             unfinished.mkdir()
             yield unfinished
@@ -138,11 +138,11 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 
 
 def _new_storage(collection: Collection, folder: Path) -> Any:
-    """An empty storage of Minari, with the environment that its episodes can be done again in."""
+    """Create an empty Minari storage, with the environment in which episodes can be reproduced."""
     from minari.dataset.minari_storage import MinariStorage
 
     with closing(collection.make_env()) as env:
-        # Minari finds no file below a relative path when it adds up their sizes.
+        # The path must be absolute: Minari computes a size of 0 for a relative path.
         return MinariStorage.new(
             folder.absolute(),
             observation_space=env.observation_space,
@@ -153,14 +153,14 @@ def _new_storage(collection: Collection, folder: Path) -> Any:
 
 
 def _require_space(folder: Path, size: float) -> None:
-    """Make sure that a disk has space, because HDF5 crashes on a full one.
+    """Check the free space of a disk, because HDF5 crashes if the disk is full.
 
     Args:
-        folder: folder that is written to.
-        size: what is needed, in bytes.
+        folder: folder on the disk.
+        size: required space, in bytes.
 
     Raises:
-        SdcError: less is free.
+        SdcError: the free space is too small.
     """
     free = shutil.disk_usage(folder).free
     if free < size:
@@ -171,7 +171,7 @@ def _require_space(folder: Path, size: float) -> None:
 
 
 def _keep(storage: Any, episode: Episode) -> None:
-    """Add an episode to a storage."""
+    """Add an episode to a Minari storage."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     arrays = (episode.observations, episode.actions, episode.rewards, *episode.infos.values())
@@ -204,7 +204,7 @@ def _keep(storage: Any, episode: Episode) -> None:
 
 
 def _metadata(made: DataSet) -> dict[str, Any]:
-    """Metadata of a data set, as Minari names it."""
+    """Return the metadata of a data set with the names that Minari uses."""
     names = ", ".join(made.collection.controllers)
     metadata: dict[str, Any] = {
         "dataset_id": made.id,

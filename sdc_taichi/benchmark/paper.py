@@ -1,10 +1,11 @@
-"""Tables 2 to 7 of SustainDC: our results in their units, beside the printed figures.
+"""Tables 2 to 7 of the SustainDC paper: our results in the paper's units, with the printed values.
 
-The columns of these tables are not what their headings say. HVAC and IT energy are mean powers in
-kW. CFP is the mean of a quarter hour, at a carbon intensity too high by that of the first hour of
-the year: the code added noise around that value where noise around 0 was meant (``CI_Manager`` in
-``utils/managers.py`` of github.com/HewlettPackard/dc-rl). Water is the sum of hourly rates over
-quarter hours. All of them follow from the metrics of a run on preset ``sustaindc``.
+The columns of these tables do not have the units in their headings. "HVAC energy" and "IT energy"
+are mean powers in kW. "CFP" is the mean carbon emission of a quarter hour, with a carbon intensity
+that is too high by the value of the first hour of the year, because the released code adds noise
+with that mean instead of mean 0 (``CI_Manager`` in ``utils/managers.py`` of
+github.com/HewlettPackard/dc-rl). "Water usage" is the sum of hourly rates, taken at every quarter
+hour. All these values can be computed from the metrics of a run with preset ``sustaindc``.
 """
 
 from __future__ import annotations
@@ -36,22 +37,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CONSTANT_ROW = "coldest"
-"""Row of a suite that holds the lowest setpoint, which all others are compared with."""
+"""Name of the row with constant lowest setpoint, the reference of all other rows."""
 _METRICS = ("cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "queue_mean_tasks", "water_l")
 _QUARTERS_PER_H = 4
 _SEED = 0
-"""Seed of the draws of intervals."""
+"""Seed of the bootstrap for confidence intervals."""
 _NO_FIGURE = Interval(math.nan, math.nan, math.nan)
 
 
 PAPER = "paper"
-"""Accounting of suites whose tables are those of SustainDC."""
+"""Value of ``Suite.accounting`` for tables with the definitions of the SustainDC paper."""
 PAPER_UNITS = (
     "Columns are in the units that the printed ones hold, not in those of their headings: mean "
     "powers, carbon of a quarter hour at an intensity that is raised by that of the first hour of "
     "the year, and a sum of hourly rates of water."
 )
-"""Units of the columns, in words."""
+"""Text that explains the units of the columns."""
 _COLUMNS = {
     "cfp_kg": "CFP (kg per quarter hour)",
     "hvac_kw": "HVAC (kW)",
@@ -69,40 +70,42 @@ PAPER_TITLES = (
     | _COLUMNS
     | {f"printed_{name}": f"printed {title}" for name, title in _COLUMNS.items()}
 )
-"""Titles of the columns of ``paper_rows``."""
+"""Title of each column of ``paper_rows``."""
 
 
 class PaperFigures(NamedTuple):
-    """The five columns of a row of the tables, in what they hold."""
+    """The five values in a row of the paper's tables, with their actual units."""
 
     cfp_kg: float
-    """Mean carbon of a quarter hour at the raised intensity, in kg; printed as CFP (kgCO2)."""
+    """Mean carbon emission of a quarter hour at the raised carbon intensity, in kg; printed as CFP
+    (kgCO2)."""
     hvac_kw: float
     """Mean power of chiller and cooling tower, in kW; printed as HVAC energy (kWh)."""
     it_kw: float
     """Mean power of the servers, in kW; printed as IT energy (kWh)."""
     queue_tasks: float
-    """Mean work that waits, in tasks of 1 % of the capacity for a step; printed as task queue."""
+    """Mean waiting work, in tasks (one task is 1 % of the capacity for one step); printed as task
+    queue."""
     water_m3h: float
-    """Sum over the quarter hours of the water drawn, in m3/h; printed as water usage (litre)."""
+    """Hourly water rate, summed over all quarter hours, in m3/h; printed as water usage (litre)."""
 
 
 class PrintedRow(Section):
     """A row of a printed table."""
 
     label: Text
-    """Name of the row as it is printed."""
+    """Printed name of the row."""
     figures: PaperFigures
-    """Figures of the row as they are printed."""
+    """Printed values of the row."""
 
 
 class PaperTable(Section):
-    """A table of the paper, and the case of suite ``paper`` that reproduces it."""
+    """A table of the SustainDC paper, and the case of suite ``paper`` that reproduces it."""
 
     number: int
     """Number of the table, 2..7."""
     panel: Annotated[str, Field(pattern="^[a-f]$")]
-    """Panel of figure 4 that shows the table, a..f."""
+    """Panel of the paper's figure 4 with the same results, a..f."""
     title: Text
     """Subject of the table."""
     case: str
@@ -110,43 +113,44 @@ class PaperTable(Section):
     site: str
     """Site of the data center."""
     noise_base_g_per_kwh: Annotated[float, Field(ge=0, le=2000)]
-    """Carbon intensity of the first hour of 2022, which is added to that of all steps, in g/kWh."""
+    """Carbon intensity of the first hour of 2022, in g/kWh, by which the released code raises the
+    carbon intensity of all steps."""
     water_steps: Annotated[int, Field(ge=1, le=35_040)]
-    """Number of quarter hours over which water is summed."""
+    """Number of quarter hours in the sum of water rates."""
     rows: dict[str, PrintedRow]
-    """Printed rows by the name of the row of suite ``paper`` that reproduces them."""
+    """Printed rows, by the name of the reproducing row in suite ``paper``."""
 
 
 @cache
 def paper_tables() -> tuple[PaperTable, ...]:
-    """Tables 2 to 7 of the paper as printed."""
+    """Return tables 2 to 7 of the SustainDC paper as printed."""
     text = resources.files("sdc_taichi.data").joinpath("paper_tables.yaml").read_text("utf-8")
     return tuple(PaperTable.model_validate(values) for values in yaml.safe_load(text))
 
 
 def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> pd.DataFrame:
-    """Rows of a table: those that are printed, and then all others of the case.
+    """Return our results beside the printed values: printed rows first, then all other rows.
 
     Args:
-        table: the table.
-        rows: dataset of a suite, with the columns of ``learning.evaluation`` and ``case``, ``row``
-            and ``seed``.
-        scored_h: scored hours of each week.
+        table: the printed table.
+        rows: results of the suite, with the columns of ``learning.evaluation`` and ``case``,
+            ``row`` and ``seed``.
+        scored_h: number of scored hours of each week.
 
     Returns:
-        Columns of ``PAPER_TITLES`` without ``table``, with ends ``_low`` and ``_high`` of 95 %
-        intervals; nan where there is no figure.
+        Table with the columns of ``PAPER_TITLES`` except ``table``, and the ends ``_low`` and
+        ``_high`` of 95 % intervals; missing values are nan.
 
     Raises:
-        ConfigError: rows of one case that are not of the same weeks.
+        ConfigError: rows of the case have different weeks.
     """
     import pandas as pd
 
-    of_case = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
-    of_case = of_case[(of_case["moves"] == ALL) & of_case["it_kwh"].notna()]
+    in_case = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
+    in_case = in_case[(in_case["moves"] == ALL) & in_case["it_kwh"].notna()]
     samples = {
         str(name): _samples(group, table, scored_h)
-        for name, group in of_case.groupby("row", sort=False)
+        for name, group in in_case.groupby("row", sort=False)
     }
     constant = samples.get(CONSTANT_ROW)
     elsewhere = {name for each in paper_tables() for name in each.rows} - set(table.rows)
@@ -155,7 +159,7 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> pd.DataF
 
 
 def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
-    """Figures by column, seed and week, (5, S, W), weeks in their order."""
+    """Return the values of the five columns by seed and week, (5, S, W); weeks are sorted."""
     ordered = rows.sort_values(["seed", "week"])
     seeds, weeks = ordered["seed"].nunique(), ordered["week"].nunique()
     if seeds * weeks != len(ordered):
@@ -178,7 +182,14 @@ def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
 def _compared_row(
     name: str, table: PaperTable, sample: F64 | None, constant: F64 | None
 ) -> dict[str, Any]:
-    """A row of a table from its samples and those of the constant setpoint, (5, S, W) each."""
+    """Return a table row with our values and the printed ones.
+
+    Args:
+        name: name of the row.
+        table: the printed table.
+        sample: our values by column, seed and week, (5, S, W); None if there are no results.
+        constant: the same for the row with constant setpoint.
+    """
     printed = table.rows.get(name)
     row: dict[str, Any] = {
         "label": name if printed is None else printed.label,
@@ -200,21 +211,21 @@ def _compared_row(
 
 
 def _interval(statistic: Statistic, *samples: F64) -> Interval:
-    """A statistic with its interval, weeks of one site being one stratum."""
+    """Return a statistic of samples from one site with its bootstrap interval."""
     strata = np.zeros(samples[0].shape[1], dtype=np.int64)
     generator = np.random.Generator(np.random.PCG64(_SEED))
     return bootstrap_interval(statistic, samples, strata, generator)
 
 
 def paper_rows(suite: SuiteResults) -> pd.DataFrame:
-    """Rows of all tables whose cases have results, ours and as printed.
+    """Return our results beside the printed values, for all tables whose cases have results.
 
     Args:
         suite: results of suite ``paper``.
 
     Returns:
-        Columns of ``PAPER_TITLES`` with ends ``_low`` and ``_high`` of intervals; nan where there
-        is no figure.
+        Table with the columns of ``PAPER_TITLES`` and the ends ``_low`` and ``_high`` of 95 %
+        intervals; missing values are nan.
     """
     import pandas as pd
 
@@ -223,7 +234,7 @@ def paper_rows(suite: SuiteResults) -> pd.DataFrame:
 
 
 def compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, pd.DataFrame]]:
-    """Tables of the paper whose cases have results, with their rows as of ``compared``.
+    """Return each printed table whose case has results, with its comparison from ``compared``.
 
     Args:
         suite: results of suite ``paper``.

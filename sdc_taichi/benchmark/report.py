@@ -1,4 +1,4 @@
-"""Report of suites: tables and pictures of each case, from folders of results alone."""
+"""Report on benchmark suites: tables and pictures of each case, from folders of results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 _PAPER_CAPTION = "Our figures, carbon with 95 % intervals, beside those printed"
 _LEAST_SHARE_PCT = -100.0
-"""Share of the achievable below which pictures leave out rows, to keep the others readable."""
+"""Minimum share of the achievable saving, in %, for a row to appear in pictures."""
 _THRESHOLDS_PCT = np.linspace(-25.0, 110.0, 136)
 READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
@@ -67,41 +67,41 @@ READING = (
     "Coordination is what agents save together beyond the sum of what each saves alone: below 0 "
     "they hinder each other, or save the same carbon twice.",
 )
-"""How to read the tables of a report."""
+"""Paragraphs that explain how to read the tables of a report."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture, which Markdown leaves out."""
+    """Picture of the HTML report; the Markdown report has no pictures."""
 
     draw: Callable[[], Figure]
-    """Draws the picture."""
+    """Function that draws the picture."""
     alt: str
-    """Text in place of the picture, for readers who cannot see it."""
+    """Alternative text for readers who cannot see the picture."""
     caption: str
-    """Text below the picture."""
+    """Caption below the picture."""
 
 
 Sections = Mapping[str, Sequence[str | Picture]]
-"""Blocks of Markdown and pictures of each section of a report, by its heading."""
+"""Content of each section of a report, as blocks of Markdown and pictures, by heading."""
 
 
 def write_report(
     folders: Sequence[Path], *, html: Path | None = None, markdown: Path | None = None
 ) -> tuple[str, ...]:
-    """Write the report of suites.
+    """Write a report on suites as an HTML page, as Markdown, or both.
 
     Args:
-        folders: folders of studies of suites.
-        html: file of the page; None is none.
-        markdown: file of the tables as Markdown; None is none.
+        folders: folders with the results of suites.
+        html: path of the HTML page; None writes no page.
+        markdown: path of the Markdown file; None writes no file.
 
     Returns:
-        Notes on what the report leaves out.
+        Notes on missing content of the report.
 
     Raises:
-        SdcError: a folder without results of a suite, a damaged result, results that cannot be
-            compared, or a file that cannot be written.
+        SdcError: a folder has no results of a suite, a result is damaged, results cannot be
+            compared, or a file cannot be written.
     """
     suites = read_suites(folders)
     title = "Benchmark" if len(suites) > 1 else suites[0].suite.title
@@ -122,11 +122,11 @@ def write_report(
 
 
 def markdown_report(title: str, sections: Sections) -> str:
-    """A report as Markdown, without its pictures.
+    """Return a report as Markdown, without pictures.
 
     Args:
         title: heading of the report.
-        sections: its sections.
+        sections: sections of the report.
     """
     parts = [f"# {literal_markdown(title)}"]
     for heading, blocks in sections.items():
@@ -136,15 +136,15 @@ def markdown_report(title: str, sections: Sections) -> str:
 
 
 def html_report(title: str, lead: str, sections: Sections) -> str:
-    """A report as one HTML page, which contains all that it shows and needs no network.
+    """Return a report as a self-contained HTML page, which needs no network access.
 
     Args:
         title: heading of the report.
-        lead: text below it.
-        sections: its sections.
+        lead: text below the heading.
+        sections: sections of the report.
 
     Raises:
-        SdcError: jinja2 is missing, or there are pictures and matplotlib is missing.
+        SdcError: jinja2 is missing, or the report has pictures and matplotlib is missing.
     """
     from markdown_it import MarkdownIt
 
@@ -162,11 +162,11 @@ def html_report(title: str, lead: str, sections: Sections) -> str:
 
 
 def report_sections(suites: Iterable[SuiteResults], folder: Path) -> Sections:
-    """Sections of the report of suites.
+    """Return the sections of a report on suites.
 
     Args:
         suites: results of the suites.
-        folder: folder of the report; links are relative to it.
+        folder: folder of the report, to which links are relative.
     """
     sections: dict[str, Sequence[str | Picture]] = {}
     for suite in suites:
@@ -184,17 +184,17 @@ def report_sections(suites: Iterable[SuiteResults], folder: Path) -> Sections:
 
 
 def _note(text: str) -> str:
-    """A paragraph that stands out."""
+    """Format a text as a highlighted paragraph in Markdown."""
     return f"> {literal_markdown(text)}"
 
 
 def _table(caption: str, frame: pd.DataFrame, titles: Mapping[str, str] = BOARD_TITLES) -> str:
-    """A table with its caption and intervals in brackets after their values."""
+    """Return a captioned table as Markdown, with intervals in brackets after their values."""
     return f"{literal_markdown(caption)}\n\n{_markdown(frame, titles)}"
 
 
 def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[str]:
-    """Subject of a suite, the commands and time behind its results, and notes on them."""
+    """Return paragraphs on the subject of a suite, its commands, processor time and notes."""
     blocks = [literal_markdown(suite.suite.about or suite.suite.title)]
     blocks += map(_note, suite_notes(suite))
     blocks += [f"    {printable(' '.join(text.split()))}" for text in suite.commands]
@@ -205,10 +205,10 @@ def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> lis
 
 
 def cost_text(suite: SuiteResults) -> str:
-    """Processor time that the results of a suite took, in words.
+    """Return a sentence with the processor time of the results of a suite.
 
     Args:
-        suite: the results.
+        suite: results of the suite.
     """
     results = suite.results
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
@@ -222,7 +222,7 @@ def cost_text(suite: SuiteResults) -> str:
 
 
 def _overview(boards: Mapping[str, Leaderboard]) -> str:
-    """Change against idle commands of each row in each case."""
+    """Return a table of the change against idle commands, with rows by cases."""
     import pandas as pd
 
     changes = {
@@ -234,10 +234,10 @@ def _overview(boards: Mapping[str, Leaderboard]) -> str:
 
 
 def suite_notes(suite: SuiteResults) -> list[str]:
-    """Notes on the results of a suite, such as what is missing.
+    """Return notes on the results of a suite, such as missing results.
 
     Args:
-        suite: the results.
+        suite: results of the suite.
     """
     results = suite.results
     notes = []
@@ -248,7 +248,7 @@ def suite_notes(suite: SuiteResults) -> list[str]:
         notes.append(f"Unfinished, without {names_text(missing)}.")
     for key, what in (("version", "versions of the package"), ("source", "states of the source")):
         values = [getattr(result.record, key)[:12] for result in results]
-        counts = Counter(filter(None, values))  # submitted tables have none
+        counts = Counter(filter(None, values))  # empty for submissions from other software
         if len(counts) > 1:
             several = [f"{value} ({count})" for value, count in counts.items()]
             notes.append(f"Results of several {what}: {names_text(several)}.")
@@ -263,7 +263,7 @@ def suite_notes(suite: SuiteResults) -> list[str]:
 
 
 def _notes_of_case(case: CaseResults) -> list[str]:
-    """Notes on the results of a case, such as too few seeds."""
+    """Return notes on the results of a case, such as too few seeds."""
     notes = []
     for name, rows in case.rows.items():
         if (about := rows[0].submission) is not None:
@@ -290,7 +290,7 @@ def _notes_of_case(case: CaseResults) -> list[str]:
 
 
 def _case_blocks(suite: SuiteResults, board: Leaderboard, folder: Path) -> list[str | Picture]:
-    """Tables and pictures of a case, with links relative to the folder of the report."""
+    """Return tables and pictures of a case; links are relative to the report's folder."""
     case = board.case
     blocks: list[str | Picture] = []
     if about := case.settings.about:
@@ -319,7 +319,7 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard, folder: Path) -> list[
 
 
 def _outage_notes(board: Leaderboard) -> list[str]:
-    """A note that places are by the objective alone, where work is lost or racks are off."""
+    """Return a note that ranks ignore outages, if work is lost or racks are off in the case."""
     broken = [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]
     text = (
         f"Places are by {board.case.objective} alone. Racks that are off and work that is lost "
@@ -329,7 +329,7 @@ def _outage_notes(board: Leaderboard) -> list[str]:
 
 
 def weeks_text(board: Leaderboard) -> str:
-    """Objective, weeks and sites of a case, in words.
+    """Return a sentence with objective, weeks and sites of a case.
 
     Args:
         board: tables of the case.
@@ -344,7 +344,7 @@ def weeks_text(board: Leaderboard) -> str:
 
 
 def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
-    """Descriptions of the rows of a case."""
+    """Return the descriptions of the rows of a case."""
     texts = []
     for name, results in board.case.rows.items():
         about = suite.suite.rows[name].about if name in suite.suite.rows else ""
@@ -357,7 +357,7 @@ def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
 
 
 def _recordings(case: CaseResults, folder: Path) -> list[str]:
-    """Links to the recordings of the results of a case, relative to a folder."""
+    """Return links to the recordings of a case's results, relative to a folder."""
     links = []
     for name, results in case.rows.items():
         for result in results:
@@ -370,7 +370,7 @@ def _recordings(case: CaseResults, folder: Path) -> list[str]:
 
 
 def case_pictures(board: Leaderboard) -> list[Picture]:
-    """Pictures of a case.
+    """Return the pictures of a case.
 
     Args:
         board: tables of the case.
@@ -384,19 +384,19 @@ def case_pictures(board: Leaderboard) -> list[Picture]:
 
 
 def _interval_picture(board: Leaderboard) -> Picture | None:
-    """Share of the achievable of each row, or its change against idle commands."""
+    """Return a picture of the share of the achievable saving, or of the change against idle."""
     table = board.standings
     has_share = "share_pct" in table
     column = "share_pct" if has_share else "change_pct"
     kinds = board.case.kinds
     ends: dict[str, tuple[float, float, float]] = {}
-    far, left = _far(board), []
+    excluded, excluded_texts = _far(board), []
     for values in table.to_dict("records"):
         name, value = str(values["row"]), float(values[column])
         if kinds[name] == BOUND or not math.isfinite(value):
             continue
-        if name in far:
-            left.append(f"{name} ({value:.0f} %)")
+        if name in excluded:
+            excluded_texts.append(f"{name} ({value:.0f} %)")
             continue
         label = f"{name} ({values['place']})" if values["place"] != "-" else name
         ends[label] = value, float(values[f"{column}_low"]), float(values[f"{column}_high"])
@@ -405,8 +405,8 @@ def _interval_picture(board: Leaderboard) -> Picture | None:
     what = "share of the achievable (%)" if has_share else "change against idle commands (%)"
     caption = f"The picture shows the {what} of each row with its 95 % interval, and its place in "
     caption += "brackets."
-    if left:
-        caption += f" Rows outside its range are left out: {', '.join(left)}."
+    if excluded_texts:
+        caption += f" Rows outside its range are left out: {', '.join(excluded_texts)}."
 
     def draw() -> Figure:
         return interval_plot(ends, what, marks=(0.0, 100.0) if has_share else (0.0,))
@@ -416,7 +416,7 @@ def _interval_picture(board: Leaderboard) -> Picture | None:
 
 
 def _far(board: Leaderboard) -> set[str]:
-    """Rows so far below idle commands that pictures are without them."""
+    """Return rows that are much worse than idle commands, which pictures leave out."""
     table = board.standings
     if "share_pct" not in table:
         return set()
@@ -424,7 +424,7 @@ def _far(board: Leaderboard) -> set[str]:
 
 
 def _chosen(board: Leaderboard) -> list[str]:
-    """Rows that pictures of lines show, no more than a reader can distinguish, in table order."""
+    """Return the rows for line plots in table order; few enough to distinguish the lines."""
     kinds = {name: kind for name, kind in board.case.kinds.items() if name not in _far(board)}
     ranks = {LEARNER: 0, OTHER: 0, PLANNER: 1, ACHIEVED: 5}
     rank = {name: ranks.get(kind, 4) for name, kind in kinds.items() if kind != BOUND}
@@ -437,7 +437,10 @@ def _chosen(board: Leaderboard) -> list[str]:
 
 
 def _profile_picture(board: Leaderboard) -> Picture:
-    """Share of weeks above each share of the achievable."""
+    """Return a picture of the performance profiles.
+
+    A profile is the share of weeks in which a row exceeds a share of the achievable saving.
+    """
     shares = column_samples(board.evaluation, "share")
     shown = {
         name: performance_profile(100.0 * shares[name], _THRESHOLDS_PCT)
@@ -457,7 +460,7 @@ def _profile_picture(board: Leaderboard) -> Picture:
 
 
 def _lacking_pictures() -> str:
-    """Why no pictures can be drawn; empty if they can."""
+    """Return the reason why pictures cannot be drawn; empty if they can."""
     try:
         new_figure(1.0, 1.0)
     except SdcError as error:
@@ -466,6 +469,6 @@ def _lacking_pictures() -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with atomic_write(path, parents=True) as file:
         file.write(text.encode("utf-8", "replace"))

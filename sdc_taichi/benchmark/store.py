@@ -1,8 +1,9 @@
-"""The folder of a study: its settings, the result of each job, and all rows as one dataset.
+"""Storage of a study in a folder: settings, results of the jobs, and a dataset of all table rows.
 
-``study.json`` holds the settings. ``jobs/COLUMN=VALUE/.../`` holds the files of a job and, written
-last, its metrics.json: a job is done if that exists and its digests fit the files. Rows are in
-``results/COLUMN=VALUE/.../rows.parquet``, a dataset with hive partitions.
+``study.json`` contains the settings. ``jobs/COLUMN=VALUE/.../`` contains the files of a job. Its
+``metrics.json`` is written last: a job is done if this file exists and its digests match the other
+files. ``results/COLUMN=VALUE/.../rows.parquet`` contains the table rows of a job; together these
+files are a Parquet dataset with Hive partitions.
 """
 
 from __future__ import annotations
@@ -30,23 +31,23 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STUDY_FILE, METRICS_FILE, ROWS_FILE = "study.json", "metrics.json", "rows.parquet"
-"""Files of a study and of a job."""
+"""File names of a study's settings, a job's metrics and a job's table rows."""
 JOBS, RESULTS = "jobs", "results"
-"""Folders of a study."""
+"""Subfolders of a study for the files of jobs and for table rows."""
 MOST_FILE_BYTES = 2_000_000_000
-"""Largest file of a result, in bytes."""
-_MOST_SEGMENT_BYTES = 255  # of a name in usual file systems
+"""Maximum size of a result file, in bytes."""
+_MOST_SEGMENT_BYTES = 255  # maximum length of a file name in common file systems
 _MOST_DIFFERENCES = 3
 
 
 class Record(BaseModel):
-    """Content of a JSON file of a known format; further entries are ignored."""
+    """Content of a JSON file with a known format; unknown entries are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True)
 
 
 class Study(Record):
-    """A study: its settings and the jobs that it is to do; content of study.json."""
+    """Settings and planned jobs of a study; content of ``study.json``."""
 
     format: Literal["sdc-study/1"] = "sdc-study/1"
     """Name and version of the format."""
@@ -55,58 +56,58 @@ class Study(Record):
     command: str
     """Command line that runs all jobs of the study."""
     settings: dict[str, Any]
-    """Values, as JSON can hold them, on which the results depend; equal for all results of a
-    folder."""
+    """Values on which the results depend, in a form for JSON; they are the same for all results in
+    a folder."""
     version: str = Field(default_factory=lambda: version("sdc-taichi"))
     """Version of the package."""
     source: str = Field(default_factory=source_digest)
     """Digest of the source files of the package."""
     partitions: list[dict[str, str]]
-    """Partition of each job that the study is to do."""
+    """Partition of each planned job of the study."""
     may_change: tuple[str, ...] = Field(default=(), exclude=True)
-    """Patterns of the dotted names of settings that may change while the study goes on; its jobs
-    may differ in them."""
+    """Patterns of dotted setting names that may change when the study is resumed; results in the
+    folder can differ in these settings."""
 
 
 class ResultRecord(Record):
-    """Content of metrics.json; equal runs differ in the last two entries alone."""
+    """Content of ``metrics.json``; repetitions of a job differ only in the last two entries."""
 
     format: Literal["sdc-result/1"]
     """Name and version of the format."""
     key: str
-    """Key of the job."""
+    """Digest of everything that determines the result (``Job.key``)."""
     function: str
-    """Function of the job."""
+    """Import path of the job's function."""
     values: dict[str, Any]
-    """Values of the job."""
+    """Arguments of the job's function."""
     inputs: dict[str, str]
-    """Identity of each input of the job."""
+    """Identity of each input of the job, by name."""
     partition: dict[str, str]
-    """Columns and values that name the result."""
+    """Columns and values that identify the result."""
     version: str
     """Version of the package."""
     source: str
     """Digest of the source files of the package."""
     rows_sha256: str
-    """Digest of the file of rows; empty if there is none."""
+    """Digest of the Parquet file with the table rows; empty if the job has no rows."""
     files_sha256: dict[str, str]
-    """Digest of each further file by its path below the folder of the job."""
+    """Digest of each further file, by path relative to the job's folder."""
     metrics: dict[str, Any]
-    """Figures of the job as a whole."""
+    """Metrics of the job as a whole."""
     core_s: float
-    """Processor time that the job took, in s."""
+    """Processor time of the job, in s."""
     processor: dict[str, Any]
-    """Features of the processor and the libraries."""
+    """Properties of processor and libraries that affect the last bits of the result."""
 
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 
 class ResultStore:
-    """Results of jobs in the folder of a study.
+    """Access to the results of jobs in the folder of a study.
 
     Args:
-        folder: the folder of the study; nothing is read or made yet.
+        folder: folder of the study; the constructor does not access it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -114,19 +115,19 @@ class ResultStore:
 
     @contextlib.contextmanager
     def claimed(self, study: Study, *, resume: bool = False) -> Iterator[tuple[str, ...]]:
-        """Keep other processes out of the folder while a study runs there.
+        """Lock the folder against other processes while a study runs there.
 
         Args:
-            study: settings and jobs; written to study.json.
-            resume: whether to continue the study in the folder. A new or empty folder begins it.
+            study: settings and jobs to write to ``study.json``.
+            resume: True to continue the study in the folder; a new or empty folder is valid, too.
 
         Yields:
-            Notes on results that are kept.
+            Notes on existing results.
 
         Raises:
-            SdcError: the folder holds other files, a study without ``resume``, or one of other
-                settings or of another version; another process runs a study there; or nothing can
-                be written there.
+            SdcError: the folder contains other files, a study (without ``resume``), or a study with
+                different settings or package version; another process runs a study there; or the
+                folder is not writable.
         """
         with naming_errors(self.folder):
             if self.folder.exists() and not self.folder.is_dir():
@@ -143,51 +144,51 @@ class ResultStore:
             claim.release()
 
     def study(self) -> Study:
-        """Content of study.json.
+        """Read ``study.json``.
 
         Raises:
-            ConfigError: there is none, or it is damaged.
+            ConfigError: the file does not exist, or is damaged.
         """
         return read_record(self.folder / STUDY_FILE, Study)
 
     def folder_of(self, partition: Mapping[str, str]) -> Path:
-        """Folder with metrics.json and further files of a job, whether it is done or not.
+        """Return the folder of a job's files, even if the job is not done.
 
         Args:
-            partition: columns and values that name the job.
+            partition: columns and values that identify the job.
 
         Raises:
-            ConfigError: a column or value that cannot be the name of a folder.
+            ConfigError: a column or value cannot be part of a folder name.
         """
         return self.folder / JOBS / partition_path(partition)
 
     def rows_path(self, partition: Mapping[str, str]) -> Path:
-        """File with the rows of a job, whether it is done or not.
+        """Return the path of the file with a job's table rows, even if the job is not done.
 
         Args:
-            partition: columns and values that name the job.
+            partition: columns and values that identify the job.
 
         Raises:
-            ConfigError: a column or value that cannot be the name of a folder.
+            ConfigError: a column or value cannot be part of a folder name.
         """
         return self.folder / RESULTS / partition_path(partition) / ROWS_FILE
 
     def result(self, partition: Mapping[str, str]) -> ResultRecord:
-        """Content of metrics.json of a job.
+        """Read ``metrics.json`` of a job.
 
         Args:
-            partition: columns and values that name the job.
+            partition: columns and values that identify the job.
 
         Raises:
-            ConfigError: there is none, or it is damaged.
+            ConfigError: the file does not exist, or is damaged.
         """
         return read_record(self.folder_of(partition) / METRICS_FILE, ResultRecord)
 
     def results(self) -> Iterator[ResultRecord]:
-        """Content of each metrics.json, in order of their folders.
+        """Yield the content of each ``metrics.json``, in the order of the folders.
 
         Raises:
-            ConfigError: one of them is damaged, or not in the folder that its partition names.
+            ConfigError: a file is damaged, or its folder does not match its partition.
         """
         for path in sorted((self.folder / JOBS).rglob(METRICS_FILE)):
             record = read_record(path, ResultRecord)
@@ -198,23 +199,23 @@ class ResultStore:
             yield record
 
     def file(self, partition: Mapping[str, str], name: str) -> bytes:
-        """Content of a file of a job.
+        """Read a file of a job.
 
         Args:
-            partition: columns and values that name the job.
-            name: path of the file below the folder of the job.
+            partition: columns and values that identify the job.
+            name: path of the file relative to the job's folder.
 
         Raises:
-            SdcError: there is no such file, or it cannot be read.
+            SdcError: the file does not exist, or cannot be read.
         """
         check_file_name(name)
         return read_bytes(self.folder_of(partition) / name, MOST_FILE_BYTES)
 
     def rows_file(self, record: ResultRecord) -> bytes:
-        """Content of the file of rows of a result; empty if it has none.
+        """Read the Parquet file with a result's table rows; empty if the result has no rows.
 
         Raises:
-            SdcError: the file is missing, cannot be read, or has another digest.
+            SdcError: the file is missing or cannot be read, or its digest does not match.
         """
         if not record.rows_sha256:
             return b""
@@ -225,7 +226,7 @@ class ResultStore:
         return content
 
     def is_done(self, job: Job) -> bool:
-        """Whether the result of the job exists, with all of its files undamaged."""
+        """Return True if the result of a job exists with all files undamaged."""
         try:
             record = self.result(job.partition)
             is_of_job = (record.key, record.partition) == (job.key, dict(job.partition))
@@ -234,13 +235,13 @@ class ResultStore:
             return False
 
     def is_whole(self, record: ResultRecord) -> bool:
-        """Whether the further files of a result have the digests that its metrics.json lists.
+        """Return True if the files of a result match the digests in its ``metrics.json``.
 
         Args:
-            record: content of metrics.json of a job.
+            record: content of ``metrics.json`` of a job.
 
         Raises:
-            SdcError: a file is missing, cannot be read, or would lie outside of the folder; or
+            SdcError: a file is missing, cannot be read, or is outside of the folder; or the table
                 rows are damaged.
         """
         self.rows_file(record)
@@ -248,13 +249,13 @@ class ResultStore:
         return all(digest_of(self.file(record.partition, name)) == x for name, x in files)
 
     def keep(self, done: DoneJob) -> None:
-        """Write the result of a job that has ended successfully.
+        """Store the result of a successful job.
 
         Args:
             done: the job with its result.
 
         Raises:
-            SdcError: something cannot be written.
+            SdcError: a file cannot be written.
         """
         job = done.job
         record = ResultRecord(
@@ -275,19 +276,19 @@ class ResultStore:
         self.write(record, done.rows, done.files)
 
     def write(self, record: ResultRecord, rows: bytes, files: Mapping[str, bytes]) -> None:
-        """Write a result, metrics.json last.
+        """Write the files of a result, with ``metrics.json`` last.
 
         Args:
-            record: content of metrics.json.
-            rows: content of the file of rows; empty if there is none.
-            files: content of further files by their paths.
+            record: content of ``metrics.json``.
+            rows: content of the Parquet file with the table rows; empty if there are no rows.
+            files: content of further files, by path relative to the job's folder.
 
         Raises:
-            SdcError: something cannot be written.
+            SdcError: a file cannot be written.
         """
         folder, rows_path = self.folder_of(record.partition), self.rows_path(record.partition)
         with naming_errors(folder):
-            # Until it exists again, the job is not done.
+            # Delete metrics.json first, so that the job counts as not done until the end.
             (folder / METRICS_FILE).unlink(missing_ok=True)
             rows_path.unlink(missing_ok=True)
         for name, content in sorted(files.items()):
@@ -297,13 +298,13 @@ class ResultStore:
         write_record(folder / METRICS_FILE, record)
 
     def rows(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Rows of all jobs that are done, with the columns of their partitions.
+        """Read the table rows of all jobs that are done, with the columns of their partitions.
 
         Args:
-            columns: names of the columns to read; None is all.
+            columns: names of the columns to read; None selects all columns.
 
         Raises:
-            SdcError: there are none, or a file is damaged.
+            SdcError: there are no rows, or a file is damaged.
         """
         import pyarrow as pa
         import pyarrow.dataset as ds
@@ -315,7 +316,7 @@ class ResultStore:
         try:
             hive = ds.HivePartitioning.discover(infer_dictionary=False)
             dataset = ds.dataset(paths, partitioning=hive, partition_base_dir=str(base))
-            # The schema of a dataset is that of its first file.
+            # Unify the schemas, because a dataset takes the schema of its first file.
             schemas = [fragment.physical_schema for fragment in dataset.get_fragments()]
             schema = pa.unify_schemas([dataset.schema, *schemas], promote_options="permissive")
             table = dataset.replace_schema(schema).to_table(columns)
@@ -325,10 +326,10 @@ class ResultStore:
         return frame
 
     def _begun_study(self, *, resume: bool) -> Study | None:
-        """The study that the folder holds; None if the folder is empty.
+        """Return the study in the folder; None if the folder is empty or does not exist.
 
         Raises:
-            ConfigError: the folder is not free.
+            ConfigError: the folder contains other files, or a study without ``resume``.
         """
         names = [name for name in list_folder(self.folder) if not name.startswith(".")]
         if STUDY_FILE in names:
@@ -346,10 +347,10 @@ class ResultStore:
         return None
 
     def _continued(self, begun: Study, wanted: Study) -> tuple[Study, tuple[str, ...]]:
-        """A study that goes on, with the jobs of both, and notes on it.
+        """Merge the jobs of the existing and the new study; return the result and notes on it.
 
         Raises:
-            ConfigError: their settings differ, which the error lists.
+            ConfigError: the settings of the two studies differ; the message lists the differences.
         """
         before, now = _flat_settings(begun), _flat_settings(wanted)
         different = [
@@ -381,13 +382,13 @@ class ResultStore:
 
 
 def partition_path(partition: Mapping[str, str]) -> Path:
-    """Path of a partition below ``jobs`` and ``results``, as hive names it: ``COLUMN=VALUE/...``.
+    """Return the relative path of a partition in Hive's notation, ``COLUMN=VALUE/...``.
 
     Args:
-        partition: columns and values; values may hold any characters, which are quoted as in URLs.
+        partition: columns and values; special characters of values are quoted as in URLs.
 
     Raises:
-        ConfigError: a column or value that cannot be the name of a folder.
+        ConfigError: a column or value cannot be part of a folder name.
     """
     segments = []
     for column, value in partition.items():
@@ -404,14 +405,14 @@ def partition_path(partition: Mapping[str, str]) -> Path:
 
 
 def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
-    """Content of a JSON file of a known format.
+    """Read a JSON file with a known format.
 
     Args:
-        path: the file.
-        model: its format.
+        path: path of the file.
+        model: class of the format.
 
     Raises:
-        ConfigError: it cannot be read, or is not of the format.
+        ConfigError: the file cannot be read, or has a different format.
     """
     text = read_text(path, MOST_METRICS_BYTES, ConfigError)
     try:
@@ -421,31 +422,31 @@ def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
 
 
 def write_record(path: Path, record: Record) -> None:
-    """Write a JSON file, whole or not at all.
+    """Write a JSON file atomically.
 
     Args:
-        path: the file.
-        record: its content.
+        path: path of the file.
+        record: content of the file.
 
     Raises:
-        SdcError: it cannot be written.
+        SdcError: the file cannot be written.
     """
     content = json.dumps(record.model_dump(), indent=1, allow_nan=False)
     _write(path, f"{content}\n".encode())
 
 
 def _flat_settings(study: Study) -> dict[str, Any]:
-    """Kind, version and settings of a study by their dotted names."""
+    """Return kind, version and settings of a study by dotted name."""
     settings = study.model_dump(mode="json")["settings"]
     return {"kind": study.kind, "version": study.version, **dict(leaves("", settings))}
 
 
 def _setting_text(values: Mapping[str, Any], name: str) -> str:
-    """A setting in messages."""
+    """Return name and value of a setting as text for messages."""
     return shortened(values[name]) if name in values else "not given"
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file and the folders it lies in, whole or not at all."""
+    """Write a file atomically, and create its parent folders."""
     with atomic_write(path, parents=True) as file:
         file.write(content)

@@ -228,8 +228,8 @@ def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | Non
         Maximum relative difference of a week's objective.
 
     Raises:
-        SdcError: the submission has no policies, a policy does not fit, there are too few weeks in
-            the case, or the policies do not reproduce the submitted results.
+        SdcError: the submission has no policies, a policy does not fit, ``weeks`` is too large, or
+            the policies do not reproduce the submitted results.
     """
     (suite,) = read_suites([to])
     check_submission(submission, suite)

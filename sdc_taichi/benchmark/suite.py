@@ -1,7 +1,8 @@
-"""Suites: which controllers are compared in which weeks of which data centers, as YAML files say.
+"""Benchmark suites: YAML files that define which controllers are compared in which data centers.
 
-A suite has cases, each of data centers and weeks, and rows, each a controller or a way to find one.
-Every row is run in every case that it is for, and seeds decide all that is random in it.
+A suite has cases and rows. A case is a set of data centers and weeks. A row is a controller, or a
+method that finds one, such as a training. Each row runs in the cases that it is intended for, once
+per seed; the seed determines everything that is random.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from sdc_taichi.learning.training_settings import merged, read_values
 from sdc_taichi.optimum.objective import Objective
 
 REFERENCE = "reference"
-"""Beginning of the names of jobs that solve for optima, which no row may have."""
+"""Name prefix of jobs that compute optima; names of rows must not begin with it."""
 Part = Literal["held-out", "validation"]
-"""Part of a case: the weeks that results are shown for, or those that choices are made by."""
+"""Part of a case: held-out weeks for the results, or validation weeks for choices."""
 _CONTENT = ("controller", "best_of", "train", "optimum")
 
 
 def _weeks(value: Any) -> Any:
-    """Weeks of the year from the name of a part of the year, or as they are."""
+    """Convert text such as ``held-out`` to weeks of the year; return other values unchanged."""
     return parse_weeks(value) if isinstance(value, str) else value
 
 
@@ -45,19 +46,20 @@ Weeks = Annotated[
 ]
 """Weeks of the year, 0..51: a list, or ``training``, ``validation`` or ``held-out``."""
 Seeds = Annotated[int, Field(strict=True, ge=1, le=1000)]
-"""Number of seeds, 1..1,000; they are 0, 1 and so on."""
+"""Number of seeds, 1..1,000; the seeds are 0, 1, 2 and so on."""
 
 
 class OtherDataCenters(Section):
-    """Data centers that results are shown for, as far as they differ from those trained in."""
+    """Data centers for the results of a case, if they differ from those of the training."""
 
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] | None = None
-    """Data center: a preset, a file, or the sections of a configuration; None is that of the
-    training."""
+    """Configuration of the data center: a preset, a file, or the sections of a configuration; None
+    selects that of the training."""
     overrides: dict[str, Any] = Field(default={})
-    """Values put into the configuration on top of those of the training, section by section."""
+    """Values that replace those of the configuration and of the training's overrides, by
+    section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
-    """Sites, one data center for each; none are those of the training."""
+    """Sites, with one data center for each site; an empty list selects those of the training."""
 
     @field_validator("config")
     @classmethod
@@ -69,34 +71,35 @@ class Case(Section):
     """Data centers and weeks in which controllers are compared."""
 
     about: Text = ""
-    """Description of the case in a sentence."""
+    """Description of the case in one sentence."""
     scenario: str | None = None
-    """Scenario of trainings whose data centers and rewards lie beneath those given here; None is
-    none."""
+    """Training scenario that provides default data centers and rewards; None selects no
+    scenario."""
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] | None = None
-    """Data center: a preset, a file, or the sections of a configuration; None is that of the
-    scenario, or preset ``corrected``."""
+    """Configuration of the data center: a preset, a file, or the sections of a configuration; None
+    selects that of the scenario, or preset ``corrected``."""
     overrides: dict[str, Any] = Field(default={})
-    """Values put into the configuration, section by section."""
+    """Values that replace those of the configuration, by section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
-    """Sites, one data center for each; none are those of the scenario, or that of the
-    configuration."""
+    """Sites, with one data center for each site; an empty list selects the sites of the scenario,
+    or the site of the configuration."""
     environment: dict[str, Any] = Field(default={})
-    """Options of the environments that trainings learn in, such as their rewards."""
+    """Options of the training environments, such as their rewards."""
     training_weeks: Weeks = Field(default="training", validate_default=True)
-    """Weeks of the year, 0..51, that trainings learn in."""
+    """Weeks of the year, 0..51, in which agents learn."""
     validation_weeks: Weeks = Field(default="validation", validate_default=True)
-    """Weeks of the year, 0..51, by which the best policy of a training and the best of several
-    controllers are chosen."""
+    """Weeks of the year, 0..51, for choosing the best policy of a training and the best of several
+    controllers."""
     weeks: Weeks = Field(default="held-out", validate_default=True)
-    """Weeks of the year, 0..51, that results are shown for."""
+    """Weeks of the year, 0..51, for which results are reported."""
     days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
-    """Days of each held-out and validation week that are run, 2..7; the first is not scored."""
+    """Number of days simulated in each held-out and validation week, 2..7; the first day is not
+    scored."""
     test: OtherDataCenters = OtherDataCenters()
-    """Data centers that results are shown for, as far as they differ from those trained in."""
+    """Data centers for the results, if they differ from those of the training."""
     optimum: bool = True
-    """Whether optima are solved for, which value what is stored or waits at the end of a week, and
-    of which the share of the achievable is derived."""
+    """True to compute optima, which give the share of the achievable saving, and the value of
+    stored energy and waiting work at the end of a week."""
 
     @field_validator("config")
     @classmethod
@@ -119,33 +122,37 @@ class Case(Section):
 
 
 class Row(Section):
-    """A controller, or how to find one: ``controller``, ``best_of``, ``train`` or ``optimum``.
+    """Entry of a suite that is compared with others: a controller, or a method that finds one.
 
-    A training is that of ``sdc-taichi train``; what is chosen, is chosen in the validation weeks.
+    Exactly one of ``controller``, ``best_of``, ``train`` and ``optimum`` is set. Choices are made
+    in the validation weeks.
     """
 
     about: Text = ""
-    """Description of the row in a sentence."""
+    """Description of the row in one sentence."""
     controller: Annotated[str, Field(min_length=1)] | None = None
-    """Controller by name, such as ``g36`` or ``load=greedy-ci,cooling=g36``."""
+    """Name of a controller, such as ``g36`` or ``load=greedy-ci,cooling=g36``."""
     best_of: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
-    """Controllers by name, of which the one is taken that does best in the validation weeks."""
+    """Names of controllers; the row uses the one with the best result in the validation weeks."""
     train: dict[str, Any] | None = None
-    """Settings of a training, on top of those of the case and of the suite."""
+    """Settings of a training, as for ``sdc-taichi train``; they take precedence over those of the
+    case and of the suite."""
     optimum: Literal["achieved", "bound"] | None = None
-    """Whether the row is the path that the optimum achieves, or the bound."""
+    """Reference from the optimum: ``achieved`` for the path that the optimum achieves in
+    simulation, ``bound`` for the bound of the objective."""
     apart: bool = False
-    """Whether each agent of a training is trained alone, the others idle, and all act together
-    afterwards."""
+    """True to train each agent separately while the others are idle, and to run all agents
+    together afterwards."""
     agents_alone: bool = False
-    """Whether each agent of what was trained is also run alone, the others idle."""
+    """True to run each trained agent also alone, while the others are idle."""
     forecast_error: str | None = None
-    """Errors of the forecasts that the row sees in held-out weeks, such as
-    ``ci=0.1,temperature=1``; None is none."""
+    """Errors of the forecasts in the held-out weeks, such as ``ci=0.1,temperature=1``; None gives
+    perfect forecasts."""
     seeds: Seeds | None = None
-    """Number of seeds, 1..1,000; None is that of the suite where anything is random, and else 1."""
+    """Number of seeds, 1..1,000; None selects the number of the suite for rows with randomness, and
+    1 for others."""
     cases: tuple[Name, ...] | None = None
-    """Cases that the row is for; None is all."""
+    """Cases in which the row runs; None selects all cases."""
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> Self:
@@ -168,42 +175,43 @@ class Row(Section):
 
     @property
     def controllers(self) -> tuple[str, ...]:
-        """Controllers that the row names."""
+        """Names of the controllers in ``controller`` or ``best_of``."""
         return (self.controller,) if self.controller is not None else self.best_of or ()
 
     @property
     def is_random(self) -> bool:
-        """Whether seeds make a difference to what the row does."""
+        """True if the behaviour of the row depends on the seed."""
         if self.train is not None or self.forecast_error is not None:
             return True
         return any("random" in (parts_of(x).values() or [x]) for x in self.controllers)
 
 
 class Suite(Section):
-    """Cases and rows, and what the tables of them are about."""
+    """Benchmark suite: cases and rows, with the objective and the texts of the result tables."""
 
     name: Name
-    """Name of the suite; by default that of its file."""
+    """Name of the suite; the default is the name of its file."""
     title: Text
-    """Title of the tables."""
+    """Title of the result tables."""
     about: Text = ""
-    """Text on what the tables show, and what they do not."""
+    """Text that explains what the tables show and what they do not show."""
     objective: str = "carbon"
-    """Compared figure, less is better: ``carbon``, ``energy``, ``cost``, ``water``, or a sum such
-    as ``carbon+0.002*water``."""
+    """Objective by which rows are compared, lower is better: ``carbon``, ``energy``, ``cost``,
+    ``water``, or a sum such as ``carbon+0.002*water``."""
     accounting: Literal["standard", "paper"] = "standard"
-    """Units and definitions of the tables: those of this package, or those of the tables of
-    SustainDC (NeurIPS 2024)."""
+    """Units and definitions of the tables: ``standard`` for those of this package, ``paper`` for
+    those of the SustainDC paper (NeurIPS 2024)."""
     seeds: Seeds = 5
-    """Number of seeds of rows in which anything is random, 1..1,000."""
+    """Number of seeds of rows with randomness, 1..1,000."""
     training: dict[str, Any] = Field(default={})
-    """Settings of all trainings, beneath those of the rows."""
+    """Default settings of all trainings; settings of a row take precedence."""
     cases: dict[Name, Case] = Field(min_length=1)
     """Data centers and weeks in which controllers are compared, by name."""
     rows: dict[Name, Row] = Field(min_length=1)
-    """Controllers by name, in the order of the tables."""
+    """Controllers and methods to compare, by name, in the order of the tables."""
     quick: dict[str, Any] = Field(default={})
-    """Values that replace others for a run of minutes; a case or row that is null is left out."""
+    """Values that replace others in a short version of the suite, which runs in minutes; the value
+    null removes a case or row."""
 
     @field_validator("objective")
     @classmethod
@@ -241,12 +249,12 @@ class Suite(Section):
         return self
 
     def to_yaml(self) -> str:
-        """YAML text of all values, ``quick`` left out."""
+        """Return all values except ``quick`` as YAML text."""
         values = self.model_dump(mode="json", exclude={"quick"}, exclude_defaults=True)
         return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
     def is_for(self, row: str, case: str) -> bool:
-        """Whether a row is run in a case.
+        """Return True if a row runs in a case.
 
         Args:
             row: name of the row.
@@ -258,16 +266,16 @@ class Suite(Section):
     def chosen(
         self, *, cases: Sequence[str] = (), rows: Sequence[str] = (), seeds: int | None = None
     ) -> Suite:
-        """The suite with some of its cases and rows, or another number of seeds.
+        """Return the suite reduced to selected cases and rows, or with another number of seeds.
 
         Args:
-            cases: names of the cases; none is all.
-            rows: names of the rows; none is all.
-            seeds: number of seeds; None is that of the suite.
+            cases: names of the cases; an empty sequence selects all cases.
+            rows: names of the rows; an empty sequence selects all rows.
+            seeds: number of seeds; None selects the number of the suite.
 
         Raises:
-            ConfigError: a name that the suite does not have, or rows that are for none of the
-                cases.
+            ConfigError: the suite has no case or row with a given name, or no selected row runs in
+                a selected case.
         """
         values = self.model_dump()
         values["seeds"] = self.seeds if seeds is None else seeds
@@ -288,7 +296,7 @@ class Suite(Section):
 
 
 def suite_names() -> list[str]:
-    """Names of the suites that come with the package."""
+    """Return the names of the suites that are part of the package."""
     folder = resources.files("sdc_taichi.configs").joinpath("suites")
     return sorted(x.name[:-5] for x in folder.iterdir() if x.name.endswith(".yaml"))
 
@@ -297,11 +305,12 @@ def load_suite(source: str, *, quick: bool = False) -> Suite:
     """Read a suite.
 
     Args:
-        source: name of a suite that comes with the package, or a YAML file.
-        quick: whether its quick form is wanted.
+        source: name of a suite in the package, or path of a YAML file.
+        quick: True to read the short version of the suite.
 
     Raises:
-        ConfigError: naming the file, the key, the value and what would be valid.
+        ConfigError: a value is not valid; the message names the file, the key, the value and valid
+            values.
     """
     if source in suite_names():
         label, name = f"suite {source}", source
@@ -324,23 +333,23 @@ def load_suite(source: str, *, quick: bool = False) -> Suite:
 
 
 def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
-    """A suite of plain values.
+    """Create a checked suite from plain values.
 
     Args:
         values: values as in a YAML file.
-        label: where they come from, at the start of every message.
+        label: origin of the values, which begins every error message.
 
     Raises:
-        ConfigError: naming the key, the value and what would be valid.
+        ConfigError: a value is not valid; the message names the key, the value and valid values.
     """
     return validated(Suite, values, label)
 
 
 def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Values of the quick form of a suite.
+    """Return the values of the short version of a suite.
 
     Raises:
-        ConfigError: it has none, or one of other cases or rows.
+        ConfigError: the suite has no short version, or that version names unknown cases or rows.
     """
     changes = values.get("quick")
     if not changes:
@@ -356,7 +365,7 @@ def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
 
 
 def _content(value: Any) -> Any:
-    """A configuration that a file holds as its sections, since other machines have no such file."""
+    """Replace the path of a configuration file by its content, which other machines can read."""
     if isinstance(value, str) and value not in preset_names():
         try:
             return json.loads(load_config(value).model_dump_json())

@@ -1,7 +1,7 @@
-"""Functions of the jobs of suites: the optima of a site's weeks, and a row of a case with one seed.
+"""Functions that the jobs of a suite run: compute the optima of a site, or run a row with one seed.
 
-They run on any machine, since all that they need is in their values and inputs. An optimum is
-solved once and kept as the files of its job, which are inputs of the rows.
+The jobs can run on any machine, because their values and inputs contain everything they need. An
+optimum is computed once and stored in the files of its job, which are inputs of the rows' jobs.
 """
 
 from __future__ import annotations
@@ -44,21 +44,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _CURVES = ("training.csv", "validation.csv")
-"""Files of a training that are kept beside its settings and policy."""
+"""Learning curves of a training, which are stored with its settings and policy."""
 _ROW = "row"
-"""Name of a controller during its evaluation; its rows are named after the row of the suite."""
+"""Placeholder name of the controller during an evaluation."""
 _SECONDS = "seconds"
-"""Column of curves that differs between equal trainings."""
+"""Column of learning curves that differs between repetitions of the same training."""
 
 
 def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
-    """Solve for the optima of a site's weeks, and value the ends of weeks.
+    """Compute the optima of a site's weeks, and the value of energy and work left at their ends.
 
     Args:
-        values: ``case``, ``part``, the number of the ``site``, and the ``objective``.
+        values: ``case``, ``part``, index of the ``site``, and ``objective``.
 
     Returns:
-        No rows; as files the entries by which ``optimum.solve`` finds the optima again.
+        Result without rows; its files are cache entries from which ``optimum.solve`` reads the
+        optima.
     """
     case, part = Case.model_validate(values["case"]), values["part"]
     config = data_centers(case, part)[values["site"]]
@@ -87,16 +88,16 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
 
 
 def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
-    """Run a row of a case with one seed: train or choose its controller, and evaluate it.
+    """Run a row of a case with one seed: train or choose the controller, and evaluate it.
 
     Args:
-        values: ``case`` and ``row``, the ``name`` of the row, settings of every ``training``, the
-            ``objective`` and the ``seed``.
-        inputs: optima of the weeks, as ``packed`` packs the files of their jobs.
+        values: ``case``, ``row``, ``name`` of the row, ``training`` (settings of all trainings),
+            ``objective`` and ``seed``.
+        inputs: optima of the weeks, as archives from ``packed``.
 
     Returns:
-        A row for each week, with the columns of ``learning.evaluation``; the policy and the curves
-        of a training as files.
+        Result with a table row for each week, with the columns of ``learning.evaluation``; its
+        files are policy and learning curves of a training.
     """
     task = _Task.model_validate(values)
     with TemporaryDirectory() as scratch:
@@ -115,10 +116,10 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
 
 
 def packed(files: Mapping[str, bytes]) -> bytes:
-    """Files of a reference job as one input: a ZIP archive with the same bits for the same files.
+    """Return the files of a job with optima as a reproducible ZIP archive, for use as an input.
 
     Args:
-        files: content by name.
+        files: content of each file by name.
     """
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
@@ -128,38 +129,38 @@ def packed(files: Mapping[str, bytes]) -> bytes:
 
 
 class _Task(BaseModel):
-    """Values of a row job: a row of a case with one seed."""
+    """Values of a job that runs a row of a case with one seed."""
 
     name: str
     """Name of the row."""
     case: Case
     """Data centers and weeks."""
     row: Row
-    """The row."""
+    """The row (controller, or method that finds one)."""
     training: dict[str, Any]
-    """Settings of every training of the suite."""
+    """Settings of all trainings of the suite."""
     objective: str
-    """Objective that is compared."""
+    """Objective by which rows are compared."""
     seed: int
-    """Seed of all that is random."""
+    """Seed of all random numbers."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Made:
-    """The controller of a row, and how it was chosen or trained."""
+    """The controller of a row, with a record of its choice or training."""
 
     spec: str
-    """Controller by name; empty for an optimum."""
+    """Name of the controller; empty for an optimum."""
     metrics: dict[str, Any]
-    """How it was chosen or trained, as metrics of the job."""
+    """Metrics of the choice or training, which become metrics of the job."""
     files: dict[str, bytes]
-    """Policies and curves of trainings by their paths."""
+    """Content of policies and learning curves of trainings, by path."""
     agents: tuple[str, ...] = ()
-    """Of load, cooling and battery what a trained policy moves."""
+    """Agents (load, cooling, battery) that a trained policy controls."""
 
 
 def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
-    """Train or choose the controller of a row."""
+    """Train or choose the controller of a row, if necessary."""
     if task.row.train is not None:
         return _trained(task, scratch, optima)
     if task.row.best_of is None:
@@ -210,9 +211,10 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
 
 
 def _files_of_training(folder: Path) -> dict[str, bytes]:
-    """Settings, curves and the best policy of a training, without what differs between equal ones.
+    """Return settings, learning curves and best policy of a training, by relative path.
 
-    Folders keep their places, so that the folder of the job is a controller ``policy:FOLDER``.
+    Data that differ between repetitions, such as times, are left out. Subfolders are preserved, so
+    that ``policy:FOLDER`` with the folder of the job is a valid controller.
     """
     import pandas as pd
 
@@ -235,9 +237,9 @@ def _files_of_training(folder: Path) -> dict[str, bytes]:
 def _weeks(
     task: _Task, part: Part, optima: Path, forecast_error: str | None = None
 ) -> Iterator[DataCenterWeeks]:
-    """Data centers and weeks of a part of a case, with their optima.
+    """Yield data centers and weeks of a part of a case, with their optima.
 
-    Warns where an optimum was not among those that are solved.
+    A warning is issued if an optimum was missing and had to be computed again.
     """
     known = set(optima.iterdir())
     with prepare(
@@ -261,7 +263,7 @@ def _weeks(
 
 
 def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
-    """A row for each week of the row's controller, and of what its agents do alone."""
+    """Evaluate the row's controller, and its agents alone; return a table row for each week."""
     import pandas as pd
 
     best = weeks.optimum
@@ -278,7 +280,12 @@ def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
 
 
 def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.DataFrame:
-    """Rows of figures alone, by what is moved; nothing is known of other metrics."""
+    """Return table rows with objective values only; other metrics are nan.
+
+    Args:
+        weeks: data centers and weeks.
+        figures: objective of each week, (B,), by value of column ``moves``.
+    """
     import numpy as np
     import pandas as pd
 
@@ -305,7 +312,7 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
 
 
 def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]:
-    """Metrics of a row job: how its controller was chosen or trained, and its weeks."""
+    """Return the metrics of a row's job: choice or training of its controller, and its weeks."""
     return made.metrics | {
         "objective": str(weeks.objective),
         "unit": weeks.objective.unit,

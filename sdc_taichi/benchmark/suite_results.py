@@ -1,7 +1,7 @@
 """Results of suites, read from folders and combined for reports.
 
-The folders hold all that is needed. So results of other authors, machines and versions of the
-package can be compared if they are of the same weeks of the same data centers.
+The folders contain all required data. Results of other authors, machines and package versions can
+therefore be compared if they have the same weeks of the same data centers.
 """
 
 from __future__ import annotations
@@ -29,35 +29,36 @@ if TYPE_CHECKING:
 
 ACHIEVED, BOUND, LEARNER = "optimum", "bound", "learner"
 PLANNER, RULE, OTHER = "planner", "rule", "other"
-"""Kinds of rows: the path that the optimum achieves, its bound, a trained policy, model-predictive
-control, another controller by name, and a submitted row that was not trained."""
+"""Kinds of rows: achieved path of the optimum, bound of the optimum, trained policy, model
+predictive control, other built-in or user-defined controller, and submitted controller."""
 SUBMISSION_FILE = "submission.json"
-"""File in the folder of a submitted row, which names its author."""
+"""Name of the file with the author of a submitted row."""
 COLUMNS = ("suite", "case", "row", "seed")
-"""Columns of the partition of a result of a suite."""
+"""Columns that identify a result of a suite (its partition)."""
 _NEEDED = ("moves", "site", "week", "figure", "valued_figure", "idle_figure", "achieved_figure")
 _SAME = 1e-6
-"""Largest relative difference of figures of idle commands between results of the same weeks."""
+"""Maximum relative difference of idle commands' objective between results of the same weeks."""
 _Text = Annotated[str, Field(max_length=1000)]
 
 
 class SubmissionRecord(Record):
-    """Content of submission.json."""
+    """Content of ``submission.json``: author and description of a submitted row."""
 
     format: Literal["sdc-submission/1"] = "sdc-submission/1"
     """Name and version of the format."""
     author: _Text
     """Name of the author."""
     about: _Text
-    """Description of the row in a sentence."""
+    """Description of the row in one sentence."""
     link: _Text
-    """Address of more information."""
+    """Web address with more information."""
     kind: Literal["learner", "controller"]
-    """Kind of the row: a trained one, which has all seeds of the suite, or any other."""
+    """Kind of the row: ``learner`` for a trained method with all seeds of the suite, ``controller``
+    for any other."""
 
 
 class _SolvedWeeks(Record):
-    """Metrics of a job that solved for the optima of a site's weeks."""
+    """Metrics of a job that computed the optima of a site's weeks."""
 
     part: str
     site: str
@@ -70,27 +71,28 @@ class RowResult:
     """Result of a row of a case with one seed."""
 
     store: ResultStore
-    """Folder of the study that holds it."""
+    """Storage of the study that contains the result."""
     record: ResultRecord
-    """Content of its metrics.json."""
+    """Content of the result's ``metrics.json``."""
     frame: pd.DataFrame
-    """Its rows, one for each data-center week, and for each agent that was run alone."""
+    """Table rows: one for each data-center week, and further ones for each agent that also ran
+    alone."""
     submission: SubmissionRecord | None
-    """Author and description of a submitted row."""
+    """Author and description of a submitted row; None if the row is part of the suite."""
 
     @property
     def folder(self) -> Path:
-        """Folder with its metrics.json."""
+        """Folder with the ``metrics.json`` of the result."""
         return self.store.folder_of(self.record.partition)
 
     @property
     def seed(self) -> int:
-        """Its seed."""
+        """Seed of the result."""
         return int(self.record.partition["seed"])
 
     @property
     def kind(self) -> str:
-        """Kind of its row, such as ``learner``."""
+        """Kind of the result's row, such as ``learner``."""
         row = self.record.values.get("row")
         if self.submission is not None:
             return LEARNER if self.submission.kind == LEARNER else OTHER
@@ -114,15 +116,16 @@ class CaseResults:
     settings: Case
     """Data centers and weeks of the case."""
     objective: Objective
-    """Objective of its figures."""
+    """Objective by which the rows are compared."""
     rows: Mapping[str, Sequence[RowResult]]
-    """Results of each row by seed; rows in the order of the suite, submitted ones last."""
+    """Results of each row, sorted by seed; rows are in the order of the suite, with submitted rows
+    last."""
     missing: tuple[str, ...]
-    """Results of the study that do not exist yet, as ``ROW, seed SEED``."""
+    """Planned results that do not exist yet, as ``ROW, seed SEED``."""
     bound: Mapping[tuple[str, int], float]
-    """Bound of the figure by site and week, as far as it is known."""
+    """Bound of the objective by site and week, where it is known."""
     optima_core_s: float
-    """Processor time that its optima took, in s."""
+    """Processor time for computing the optima of the case, in s."""
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -140,11 +143,11 @@ class SuiteResults:
     """All results of a suite."""
 
     suite: Suite
-    """The suite, as study.json has it."""
+    """The suite, as recorded in ``study.json``."""
     quick: bool
-    """Whether they are those of its quick form."""
+    """True if the results are from the short version of the suite."""
     commands: tuple[str, ...]
-    """Command lines that made the results."""
+    """Command lines that produced the results."""
     cases: Mapping[str, CaseResults]
     """Results of each case, in the order of the suite."""
 
@@ -160,14 +163,14 @@ class SuiteResults:
 
 
 def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
-    """Read results of suites, each suite from all folders that hold results of it.
+    """Read the results of suites; results of a suite in several folders are combined.
 
     Args:
         folders: folders of studies.
 
     Raises:
-        SdcError: a folder without a study of a suite, a damaged result, or results that are not of
-            the same weeks of the same data centers.
+        SdcError: a folder contains no study of a suite, a result is damaged, or results differ in
+            their weeks or data centers.
     """
     stores: dict[str, list[ResultStore]] = {}
     for store in map(ResultStore, folders):
@@ -176,13 +179,13 @@ def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
 
 
 def suite_of(store: ResultStore) -> Suite:
-    """The suite of a study.
+    """Return the suite of a study.
 
     Args:
-        store: folder of the study.
+        store: storage of the study.
 
     Raises:
-        ConfigError: the study is of another kind, or its suite is not valid.
+        ConfigError: the study is not a run of a suite, or its suite is not valid.
     """
     study = store.study()
     if study.kind != "suite":
@@ -194,14 +197,14 @@ def suite_of(store: ResultStore) -> Suite:
 
 
 def read_result(store: ResultStore, record: ResultRecord) -> RowResult:
-    """Read the rows of a result and check that they have the digest in its metrics.json.
+    """Read the table rows of a result, and check them against the digest in ``metrics.json``.
 
     Args:
-        store: folder of the study that holds it.
-        record: content of its metrics.json.
+        store: storage of the study that contains the result.
+        record: content of the result's ``metrics.json``.
 
     Raises:
-        SdcError: a file is missing or damaged, or its rows are not those of a row of a suite.
+        SdcError: a file is missing or damaged, or does not contain results of a suite.
     """
     import pandas as pd
 
@@ -217,12 +220,13 @@ def read_result(store: ResultStore, record: ResultRecord) -> RowResult:
 
 
 def evaluation_of(case: CaseResults) -> Evaluation:
-    """Results of a case as an evaluation, rows as controllers and seeds as trainings.
+    """Convert results of a case to an evaluation, with rows as controllers, seeds as trainings.
 
-    What agents do alone is left in it, but for the optimum, whose figures are ``alone``.
+    Runs of single agents are included, except for those of the optimum, whose objective values
+    become ``Evaluation.alone``.
 
     Args:
-        case: the case.
+        case: results of the case.
     """
     import pandas as pd
 
@@ -250,13 +254,13 @@ def evaluation_of(case: CaseResults) -> Evaluation:
 
 
 def check_partition(partition: Mapping[str, str]) -> None:
-    """Check that a partition is that of a result of a suite.
+    """Check that a partition can identify a result of a suite.
 
     Args:
-        partition: its columns and values.
+        partition: columns and values.
 
     Raises:
-        ConfigError: other columns, or a seed that is no number.
+        ConfigError: the columns are not ``COLUMNS``, or the seed is not a whole number.
     """
     if set(partition) != set(COLUMNS):
         raise ConfigError(f"partition {dict(partition)}: valid columns are {', '.join(COLUMNS)}")
@@ -265,14 +269,14 @@ def check_partition(partition: Mapping[str, str]) -> None:
 
 
 def check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
-    """Check that all rows of a case are of the same weeks of the same data centers.
+    """Check that all rows of a case have the same weeks of the same data centers.
 
     Args:
         case: name of the case.
         rows: results of each row by seed.
 
     Raises:
-        ConfigError: other weeks, or other figures of idle commands with the same seed.
+        ConfigError: the weeks differ, or the objective of idle commands differs for equal seeds.
     """
     first_of_seed: dict[int, pd.DataFrame] = {}
     first = next(iter(rows.values()))[0]
@@ -296,12 +300,12 @@ def check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
 
 
 def _weeks(result: RowResult) -> pd.DataFrame:
-    """Rows of a result that move all, by site and week."""
+    """Return the table rows of a result in which all agents act, indexed by site and week."""
     return result.frame[result.frame["moves"] == ALL].set_index(["site", "week"])
 
 
 def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
-    """Results of one suite from several folders."""
+    """Combine the results of one suite from several folders."""
     suite, studies = suite_of(stores[0]), [store.study() for store in stores]
     references: list[ResultRecord] = []
     rows: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in suite.cases}
@@ -357,10 +361,10 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
 
 
 def _add(by_seed: dict[int, RowResult], result: RowResult) -> None:
-    """Add a result, unless another folder has an equal one.
+    """Add a result to the results by seed; ignore a duplicate from another folder.
 
     Raises:
-        ConfigError: another folder has a different one.
+        ConfigError: another folder has a different result with the same seed.
     """
     other = by_seed.setdefault(result.seed, result)
     if other.record.rows_sha256 != result.record.rows_sha256:
@@ -371,7 +375,7 @@ def _add(by_seed: dict[int, RowResult], result: RowResult) -> None:
 
 
 def _bounds(references: Sequence[ResultRecord]) -> dict[tuple[str, int], float]:
-    """Bound of the figure by site and week, from the results of jobs that solved for optima."""
+    """Return the bound of the objective by site and week, from jobs that computed optima."""
     bounds: dict[tuple[str, int], float | None] = {}
     for record in references:
         name = f"metrics.json of {'/'.join(record.partition.values())}"

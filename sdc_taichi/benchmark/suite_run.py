@@ -1,4 +1,4 @@
-"""The run of a suite: jobs that solve for optima, then jobs of the rows, which read the optima."""
+"""Execution of a suite: jobs that compute the optima, then jobs of the rows, which use them."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from sdc_taichi.learning.policy import WEIGHTS
 
 _FUNCTIONS = "sdc_taichi.benchmark.suite_jobs"
 OPTIMA, ROWS = "optima", "rows"
-"""Names of the stages of a suite."""
+"""Names of the two stages of a suite's execution."""
 _MAY_CHANGE = ("suite.rows.*", "suite.title", "suite.seeds", "suite.training*", "*.about")
-"""Settings of a suite that may change while its study goes on; what depends on them is redone."""
+"""Patterns of suite settings that may change when a study is resumed; affected jobs run again."""
 
 
 class RunStage(Protocol):
-    """Runs the jobs of a stage that are not done, and keeps their results."""
+    """Function that runs those jobs of a stage that have no results yet, and stores the results."""
 
     def __call__(
         self, stage: str, jobs: Sequence[Job], total: int, inputs: Inputs | None = None, /
     ) -> JobSummary:
-        """Run jobs.
+        """Run the jobs of a stage.
 
         Args:
             stage: name of the stage.
             jobs: the jobs.
-            total: number of the jobs.
+            total: number of jobs.
             inputs: content of inputs by name.
         """
         ...
 
 
 def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) -> Study:
-    """The study of a run of a suite: its settings, and the jobs that it is to do.
+    """Return the study for a run of a suite, with its settings and planned jobs.
 
     Args:
         suite: the whole suite.
-        chosen: the suite with the chosen cases, rows and seeds.
-        command: command line that runs the suite, or goes on with it.
-        quick: whether it is the quick form of a suite.
+        chosen: the suite reduced to the selected cases, rows and seeds.
+        command: command line that runs or resumes the suite.
+        quick: True for the short version of a suite.
     """
     references = reference_jobs(chosen)
     return Study(
@@ -59,7 +59,7 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
 
 
 def reference_jobs(suite: Suite) -> list[Job]:
-    """Jobs that solve for the optima of a suite, one for each case, part and site.
+    """Return the jobs that compute the optima of a suite, one for each case, part and site.
 
     Args:
         suite: the suite.
@@ -87,11 +87,11 @@ def reference_jobs(suite: Suite) -> list[Job]:
 
 
 def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
-    """Jobs that run the rows of a suite, one for each case, row and seed.
+    """Return the jobs that run the rows of a suite, one for each case, row and seed.
 
     Args:
         suite: the suite.
-        references: jobs that have solved for its optima.
+        references: finished jobs that computed the optima of the suite.
     """
     jobs = []
     files = {name: _files(case) for name, case in suite.cases.items()}
@@ -123,12 +123,12 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
 
 
 def run_suite(suite: Suite, store: ResultStore, run: RunStage) -> None:
-    """Run the jobs of a suite that are not done.
+    """Run those jobs of a suite that have no results yet.
 
     Args:
         suite: the suite.
-        store: where results are kept; the folder is claimed.
-        run: runs the jobs of a stage.
+        store: storage of the results, whose folder must be claimed.
+        run: function that runs the jobs of a stage.
 
     Raises:
         SdcError: a result cannot be written or read.
@@ -141,7 +141,7 @@ def run_suite(suite: Suite, store: ResultStore, run: RunStage) -> None:
 
 
 def _optima(store: ResultStore, references: Sequence[Job]) -> Mapping[str, bytes]:
-    """Optima that are solved, as inputs by the names of their jobs."""
+    """Return the computed optima as inputs, by the names of their jobs."""
     optima = {}
     for job in references:
         if store.is_done(job):
@@ -151,7 +151,7 @@ def _optima(store: ResultStore, references: Sequence[Job]) -> Mapping[str, bytes
 
 
 def _steps(job: Job) -> int:
-    """Steps that a job trains for: the longest jobs begin first, so that workers end together."""
+    """Return a job's training steps, for starting long jobs first so that all end together."""
     train = job.values["row"]["train"]
     if train is None:
         return 0
@@ -159,12 +159,12 @@ def _steps(job: Job) -> int:
 
 
 def _files(case: Case) -> dict[str, dict[str, str]]:
-    """Digests of the input files that data centers of a case name, by path; empty without any.
+    """Return the digests of the input files of a case's data centers, by path.
 
-    Another file in the place makes other jobs, though the case is the same.
+    The digests are part of the jobs' values, so that the jobs change with the content of a file.
 
     Raises:
-        SdcError: a file that cannot be read.
+        SdcError: a file cannot be read.
     """
     configs = [x for part in get_args(Part) for x in data_centers(case, part)]
     paths = sorted({path for config in configs for path in input_paths(config)})
@@ -172,9 +172,9 @@ def _files(case: Case) -> dict[str, dict[str, str]]:
 
 
 def _policies(row: Row) -> dict[str, str]:
-    """Digests of the policies that the controllers of a row name, by their folders.
+    """Return the digests of the policies in a row's controllers, by folder.
 
-    Another policy in the folder makes another job, though the row is the same.
+    The digests are part of the jobs' values, so that the jobs change with the policy in a folder.
     """
     digests = {}
     for spec in row.controllers:
@@ -187,7 +187,7 @@ def _policies(row: Row) -> dict[str, str]:
 
 
 def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:
-    """Parts of a case whose optima its rows need."""
+    """Return the parts of a case (held-out, validation) whose optima its rows need."""
     of_rows = [_parts_of(row) for name, row in suite.rows.items() if suite.is_for(name, case)]
     needed = {part for parts in of_rows for part in parts}
     order: tuple[Part, ...] = ("held-out", "validation")
@@ -195,6 +195,6 @@ def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:
 
 
 def _parts_of(row: Row) -> tuple[Part, ...]:
-    """Parts of a case whose optima a row needs."""
+    """Return the parts of a case (held-out, validation) whose optima a row needs."""
     chooses = row.train is not None or row.best_of is not None
     return ("held-out", "validation") if chooses else ("held-out",)

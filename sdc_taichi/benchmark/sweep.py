@@ -1,8 +1,9 @@
-"""Sweeps: data centers that differ in some fields, each in chosen months under chosen controllers.
+"""Parameter sweeps: simulate a data center with all combinations of values of some fields.
 
-A job runs up to ``Sweep.part_size`` combinations of values in one month under one controller. A
-combination has the same figures, to the bit, in any batch and alone: all have the seed of the
-sweep, and the name of their site, so they meet the same events and errors of forecasts.
+Each combination is simulated in chosen months with chosen controllers. A job runs up to
+``Sweep.part_size`` combinations as a batch, in one month with one controller. The results of a
+combination do not depend on its batch, to the last bit: all combinations have the seed of the sweep
+and the name of their site, and so have the same sampled events and forecast errors.
 """
 
 from __future__ import annotations
@@ -53,45 +54,47 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_RUNS = 100_000
-"""Most runs of a sweep, unless a larger number is allowed."""
+"""Default maximum number of runs of a sweep."""
 MOST_DCS, MOST_RACKS = 1024, 2**18
-"""Most data centers of a job, and most racks of all of them, unless a sweep has its own ``batch``:
-larger batches are no faster and need more memory."""
+"""Default maximum of data centers per job, and of the racks of all of them. Larger batches need
+more memory without being faster."""
 _CONFIG, _FILE = "config", "file "
 _TRIED = 100
-"""Combinations of which one must be valid for a sweep to begin."""
+"""Number of combinations to check before a sweep begins; at least one of them must be valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Runs of a data center with all combinations of values, months and controllers."""
+    """Definition of a sweep: runs with all combinations of field values, months and controllers."""
 
     config: DataCenterConfig
-    """Data center whose fields are varied."""
+    """Configuration of the data center whose fields are varied."""
     varied: tuple[Varied, ...]
-    """Fields that are varied. Combinations are those of all grids with each sample of all
+    """Varied fields. Each combination of the listed values is run with each sample of the
     ranges."""
     samples: int = 0
     """Number of samples of the ranges; 0 without ranges."""
     controllers: tuple[str, ...] = ("idle",)
     """Names of the controllers."""
     months: tuple[int, ...] = ()
-    """Months, 1..12, each a run from its first day; empty is one run from ``site.start``."""
+    """Months, 1..12, with a run from the first day of each; if empty, a single run begins at
+    ``site.start``."""
     days: float | None = None
-    """Length of each run, in days; None is the whole month, or a year without months."""
+    """Length of each run, in days; None selects the whole month, or a year if ``months`` is
+    empty."""
     seed: int = 0
-    """Seed of samples, sampled events, controllers and errors of forecasts."""
+    """Seed of samples, sampled events, controllers and forecast errors."""
     forecast_error: ForecastError = PERFECT
-    """How the forecasts of controllers err."""
+    """Sizes of the errors of the forecasts that controllers get."""
     precision: Precision = "f32"
     """Precision of the server kernels."""
     batch: int | None = None
-    """Most data centers of a job, on which no figure depends; None is ``MOST_DCS`` that have
-    ``MOST_RACKS`` together."""
+    """Maximum number of data centers per job, which does not affect results; None selects
+    ``MOST_DCS``, with at most ``MOST_RACKS`` racks in total."""
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Fields that are varied, in their order."""
+        """Dotted paths of the varied fields, in order."""
         return tuple(one.field for one in self.varied)
 
     @property
@@ -102,16 +105,16 @@ class Sweep:
 
     @property
     def runs(self) -> int:
-        """Number of runs: combinations in each month under each controller."""
+        """Number of runs: combinations times months times controllers."""
         return self.combinations * max(len(self.months), 1) * len(self.controllers)
 
     @property
     def part_size(self) -> int:
-        """Number of combinations of a job; the last one of a month may have fewer."""
+        """Number of combinations per job; the last job of a month can have fewer."""
         return self.batch or max(1, min(MOST_DCS, MOST_RACKS // self.config.hall.racks))
 
     def settings(self) -> dict[str, Any]:
-        """Values on which the jobs depend, as JSON can hold them."""
+        """Return the values on which the jobs depend, in a form for JSON."""
         return {
             "config": self.config.model_dump(mode="json"),
             "varied": [asdict(one) for one in self.varied],
@@ -127,7 +130,7 @@ class Sweep:
 
 
 def combinations(sweep: Sweep) -> Iterator[tuple[Any, ...]]:
-    """Combinations of values of a sweep, in the order of its fields."""
+    """Yield each combination of values of a sweep; values have the order of ``sweep.fields``."""
     grids = [one for one in sweep.varied if isinstance(one, Grid)]
     ranges = [one for one in sweep.varied if not isinstance(one, Grid)]
     order = [[*grids, *ranges].index(one) for one in sweep.varied]
@@ -138,14 +141,14 @@ def combinations(sweep: Sweep) -> Iterator[tuple[Any, ...]]:
 
 
 def check_sweep(sweep: Sweep, most_runs: int = MOST_RUNS) -> None:
-    """Check that a sweep can begin; single combinations may still fail.
+    """Check that a sweep can begin; single combinations can still fail later.
 
     Args:
         sweep: the sweep.
-        most_runs: most runs that it may have.
+        most_runs: maximum number of runs.
 
     Raises:
-        SdcError: too many runs, options that do not fit together, or none of the first
+        SdcError: the sweep has too many runs, options contradict each other, or none of the first
             combinations is valid.
     """
     fields = sweep.fields
@@ -179,11 +182,11 @@ def check_sweep(sweep: Sweep, most_runs: int = MOST_RUNS) -> None:
 
 
 def sweep_jobs(sweep: Sweep, inputs: Inputs) -> Iterator[Job]:
-    """Jobs of a sweep: parts of its combinations, month by month, for each controller.
+    """Yield the jobs of a sweep; each runs some combinations in one month with one controller.
 
     Args:
         sweep: the sweep.
-        inputs: content of its inputs, of ``sweep_inputs``.
+        inputs: content of the inputs, from ``sweep_inputs``.
     """
     digests = {name: digest_of(content) for name, content in inputs.items()}
     columns = [[one.field, one.kind] for one in sweep.varied]
@@ -211,10 +214,10 @@ def sweep_jobs(sweep: Sweep, inputs: Inputs) -> Iterator[Job]:
 
 
 def sweep_inputs(sweep: Sweep) -> dict[str, bytes]:
-    """Content of the inputs of a sweep by name: its config and the files that it names.
+    """Return the inputs of a sweep by name: its configuration and the content of input files.
 
     Raises:
-        SdcError: a file that cannot be read, or is too large.
+        SdcError: a file cannot be read, or is too large.
     """
     config = json.dumps(sweep.config.model_dump(mode="json"), sort_keys=True).encode()
     grids = [one for one in sweep.varied if isinstance(one, Grid) and one.field in FILE_FIELDS]
@@ -225,17 +228,18 @@ def sweep_inputs(sweep: Sweep) -> dict[str, bytes]:
 
 
 def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
-    """Run a part of a sweep: the function of its jobs.
+    """Run some combinations of a sweep as a batch; this is the function of a sweep's jobs.
 
     Args:
-        values: ``columns``, field and kind of each, ``cells`` with the values of each combination,
-            ``controller``, ``start`` (MM-DD), ``days``, ``seed``, ``forecast_error`` and
-            ``precision``.
-        inputs: ``config``, the values of the data center as JSON, and the content of files.
+        values: ``columns`` (name and type of each varied field), ``cells`` (values of each
+            combination), ``controller``, ``start`` (MM-DD), ``days``, ``seed``,
+            ``forecast_error`` and ``precision``.
+        inputs: ``config``, the configuration as JSON, and the content of input files.
 
     Returns:
-        A row for each combination with its values, its site and all metrics of its run. The metrics
-        of the job are ``failed``, combinations without a row and why, and ``notes`` on inputs.
+        Result with a row for each successful combination: its values, its site and all metrics of
+        its run. The metrics of the job are ``failed`` (failed combinations with their errors) and
+        ``notes`` (remarks on inputs).
     """
     cells: list[list[Any]] = values["cells"]
     fields = [field for field, _ in values["columns"]]
@@ -265,7 +269,7 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
             outcomes |= _run_batch(named, values, notes)
 
     def with_names(text: str) -> str:
-        """A message with files by their names in the sweep, which are the same everywhere."""
+        """Replace paths of temporary files in a message by the original paths."""
         for name, path in files.items():
             text = text.replace(path, name)
         return text
@@ -283,7 +287,7 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
 
 
 def metric_names(config: DataCenterConfig) -> tuple[str, ...]:
-    """Names of the metrics that the rows of a sweep of a data center have."""
+    """Return the names of the metrics in the result rows of a sweep of a data center."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OddInputWarning)
         fleet = build_fleet(config)
@@ -295,19 +299,19 @@ def metric_names(config: DataCenterConfig) -> tuple[str, ...]:
 def _run_batch(
     configs: Sequence[tuple[int, DataCenterConfig]], values: Mapping[str, Any], notes: list[str]
 ) -> dict[int, dict[str, Metric] | str]:
-    """Site and metrics of data centers by their places, or the error of those that fail.
+    """Simulate data centers as one batch; return site and metrics, or an error, by index.
 
-    They run as one batch; if one fails, the batch is halved until that one is isolated.
+    If a data center fails, the batch is halved repeatedly until the failing one is isolated.
 
     Args:
-        configs: place and configuration of each data center.
+        configs: index and configuration of each data center.
         values: values of the job.
-        notes: notes on inputs are added to it.
+        notes: list to which remarks on inputs are appended.
     """
     batch = [config for _, config in configs]
     try:
         with warnings.catch_warnings():
-            # A warning for each combination would hide the others.
+            # Suppress these warnings: one per combination would hide all other warnings.
             warnings.simplefilter("ignore", OddInputWarning)
             sim = Simulator(batch, precision=values["precision"])
         with sim:
@@ -326,15 +330,15 @@ def _run_batch(
         half = len(configs) // 2
         return _run_batch(configs[:half], values, notes) | _run_batch(configs[half:], values, notes)
     return {
-        place: {"site": site, **of_dc}
-        for (place, _), site, of_dc in zip(configs, locations(batch), metrics, strict=True)
+        place: {"site": site, **dc_metrics}
+        for (place, _), site, dc_metrics in zip(configs, locations(batch), metrics, strict=True)
     }
 
 
 def _rows(
     values: Mapping[str, Any], outcomes: Mapping[int, Mapping[str, Metric] | str]
 ) -> pd.DataFrame | None:
-    """Rows of combinations: their values, their site and their metrics; None without any."""
+    """Return a table row for each successful combination; None if all combinations failed."""
     import pandas as pd
 
     metrics = {
@@ -347,23 +351,23 @@ def _rows(
     for at, (field, kind) in enumerate(values["columns"]):
         columns[field] = _column([values["cells"][place][at] for place in places], kind)
     for name in metrics[places[0]]:
-        of_places = [metrics[place][name] for place in places]
-        columns[name] = _column(of_places, kind_of(of_places))
+        column = [metrics[place][name] for place in places]
+        columns[name] = _column(column, kind_of(column))
     return pd.DataFrame(columns)
 
 
 def _run_days(sweep: Sweep, place: int) -> float:
-    """Length of the runs of the month at a place of ``months``, in days."""
+    """Return the length of the runs, in days, in the month with index ``place``."""
     if sweep.days is not None:
         return sweep.days
     return DAYS_PER_MONTH[sweep.months[place] - 1] if sweep.months else DAYS_PER_YEAR
 
 
 def _first_valid(sweep: Sweep) -> DataCenterConfig:
-    """Data center of the first combination that is valid, of the first ones.
+    """Return the data center of the first valid combination, out of the first ``_TRIED`` ones.
 
     Raises:
-        ConfigError: none of them is.
+        ConfigError: none of these combinations is valid.
     """
     first_error = ""
     for values in itertools.islice(combinations(sweep), _TRIED):
@@ -375,7 +379,7 @@ def _first_valid(sweep: Sweep) -> DataCenterConfig:
 
 
 def _base(inputs: Inputs, files: Mapping[str, str], start: str) -> DataCenterConfig:
-    """Data center of the inputs of a job, from a day on, with its files where they lie here."""
+    """Return the configuration in a job's inputs, with a start day and the local file paths."""
     config = config_from_dict(json.loads(inputs[_CONFIG]))
     named = {field: files.get(value_at(config, field)) for field in FILE_FIELDS}
     assigned = {field: path for field, path in named.items() if path is not None}
@@ -383,12 +387,12 @@ def _base(inputs: Inputs, files: Mapping[str, str], start: str) -> DataCenterCon
 
 
 def _written_files(inputs: Inputs, folder: Path) -> dict[str, str]:
-    """Files of the inputs, written to a folder: their paths there by those of the sweep."""
+    """Write the input files to a folder; return the new path of each original path."""
     written: dict[str, str] = {}
     for name, content in inputs.items():
         if name.startswith(_FILE):
             path = name.removeprefix(_FILE)
-            # A weather file without a city is named by its stem.
+            # Preserve the file name: a weather file without a city is named after its stem.
             file = folder / str(len(written)) / Path(path).name
             file.parent.mkdir()
             file.write_bytes(content)
@@ -397,12 +401,12 @@ def _written_files(inputs: Inputs, folder: Path) -> dict[str, str]:
 
 
 def _column(values: Sequence[Any], kind: Kind) -> pd.Series:
-    """A column of values; without a value numbers are nan."""
+    """Return values as a table column; missing numbers (None) become nan."""
     import pandas as pd
 
     if kind == "text":
         texts = [None if value is None else value_text(value) for value in values]
-        # Unlike one of objects, it is one of texts even where no value is.
+        # Use the string type: a column of objects would lose its type if all values are missing.
         return pd.Series(texts, dtype="string")
     if kind == "float64":
         values = [float("nan") if value is None else value for value in values]

@@ -1,4 +1,4 @@
-"""Fields that a sweep varies: listed values, values at even steps, and ranges to draw from."""
+"""Configuration fields that a sweep varies: lists of values, equally spaced values, and ranges."""
 
 from __future__ import annotations
 
@@ -18,48 +18,48 @@ from sdc_taichi.number_text import parse_number
 Kind = Literal["int64", "float64", "bool", "text"]
 """Type of a column of values."""
 _BLOCK = 1024
-"""Points of a Sobol sequence that are drawn at a time; a power of two keeps it balanced."""
+"""Number of Sobol points drawn at a time; a power of two, so that the points are balanced."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A field of the configuration and all values that it takes."""
+    """A configuration field with the list of its values in a sweep."""
 
     field: str
     """Dotted path of the field."""
     values: tuple[Any, ...]
-    """The values, plain as in a YAML file."""
+    """Values of the field, as in a YAML file."""
 
     @property
     def kind(self) -> Kind:
-        """Type of a column of the values."""
+        """Type of a table column with the values."""
         return kind_of(self.values)
 
     def with_value(self, value: Any) -> Grid:
-        """The grid with one more value at its end, unless it has that value."""
+        """Return the grid with one more value at its end, unless the grid contains the value."""
         return self if value in self.values else replace(self, values=(*self.values, value))
 
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A field of the configuration and the range that samples of it are drawn from evenly."""
+    """A configuration field with the range from which its values are drawn uniformly."""
 
     field: str
     """Dotted path of the field."""
     low: float
-    """Least value."""
+    """Minimum value."""
     high: float
-    """Largest value."""
+    """Maximum value."""
     is_whole: bool
-    """Whether whole numbers are drawn, both ends among them."""
+    """True if only whole numbers are drawn, including both ends."""
 
     @property
     def kind(self) -> Kind:
-        """Type of a column of the samples."""
+        """Type of a table column with the samples."""
         return "int64" if self.is_whole else "float64"
 
     def at(self, share: float) -> float:
-        """The value at a share of the range, 0..1 without the 1."""
+        """Return the value at a relative position in the range, at least 0 and less than 1."""
         if self.is_whole:
             return int(self.low) + int(share * (int(self.high) - int(self.low) + 1))
         return self.low + share * (self.high - self.low)
@@ -70,7 +70,7 @@ Varied = Grid | Range
 
 
 def kind_of(values: Sequence[Any]) -> Kind:
-    """Type of a column of plain values: text if they are of different types."""
+    """Return the type of a table column of plain values; text if the types differ."""
     if all(isinstance(value, bool) for value in values):
         return "bool"
     if all(_is_number(value) and isinstance(value, int) for value in values):
@@ -80,19 +80,19 @@ def kind_of(values: Sequence[Any]) -> Kind:
 
 
 def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
-    """A field and its values from a text such as ``hvac.setpoint.initial_c=16:26:1``.
+    """Parse a field and its values from a text such as ``hvac.setpoint.initial_c=16:26:1``.
 
-    Values are a list ``A,B,C``, numbers ``START:STOP:STEP`` of which STOP may be the last, or a
-    range ``LOW..HIGH`` that samples are drawn from. Those of a field that holds a fraction are
-    fractions, whatever their text.
+    Values are a list ``A,B,C``, numbers ``START:STOP:STEP`` (up to and including STOP),
+    or a range ``LOW..HIGH`` from which samples are drawn. Numbers become floats if the field holds
+    a float.
 
     Args:
         text: the text.
         config: the configuration whose field is varied.
-        most: most values of a grid.
+        most: maximum number of values in a list.
 
     Raises:
-        ConfigError: naming the text and what is valid.
+        ConfigError: the text is not valid; the message names it and what is valid.
     """
     path, sign, listed = (part.strip() for part in text.partition("="))
     where = f"vary {shortened(text)}"
@@ -125,7 +125,7 @@ def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
 
 
 def value_at(config: DataCenterConfig, path: str) -> Any:
-    """Plain value of a config at a dotted path; None if there is none."""
+    """Return the plain value of a configuration at a dotted path; None if it does not exist."""
     value: Any = config.model_dump(mode="json", include={path.partition(".")[0]})
     for key in path.split("."):
         if isinstance(value, Mapping):
@@ -138,18 +138,18 @@ def value_at(config: DataCenterConfig, path: str) -> Any:
 
 
 def draw(ranges: Sequence[Range], samples: int, seed: int) -> Iterator[tuple[float, ...]]:
-    """Samples of some ranges together, evenly spread over all of them.
+    """Draw low-discrepancy samples from the product of several ranges.
 
-    They are points of a scrambled Sobol sequence (Owen 1998, "Scrambling Sobol' and
-    Niederreiter-Xing points"), so that the first of many samples are those of fewer.
+    The samples are points of a scrambled Sobol sequence (Owen 1998, "Scrambling Sobol' and
+    Niederreiter-Xing points"). A larger number of samples extends the sequence of a smaller number.
 
     Args:
         ranges: the ranges.
         samples: number of samples.
-        seed: of the scrambling.
+        seed: seed of the scrambling.
 
     Yields:
-        A value for each of the ranges.
+        A tuple with a value from each range.
     """
     from scipy.stats import qmc
 
@@ -164,18 +164,18 @@ def draw(ranges: Sequence[Range], samples: int, seed: int) -> Iterator[tuple[flo
 
 
 def combination_text(fields: Iterable[str], values: Iterable[Any]) -> str:
-    """Fields and their values as a text, such as ``hvac.setpoint.initial_c=24, site.seed=3``."""
+    """Return fields and values as text, such as ``hvac.setpoint.initial_c=24, site.seed=3``."""
     pairs = zip(fields, values, strict=True)
     return ", ".join(f"{field}={value_text(value)}" for field, value in pairs)
 
 
 def value_text(value: Any) -> str:
-    """A plain value as a text that reads back equal."""
+    """Return a plain value as text, from which an equal value can be parsed."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def _range(path: str, ends: str, default: Any, where: str) -> Range:
-    """The range of a text ``LOW..HIGH``, both of which are numbers."""
+    """Parse the range ``LOW..HIGH``; both ends must be numbers."""
     low, high = (parse_number(part) for part in ends.split(".."))
     if not low < high:
         raise ConfigError(f"{where}: the range is empty; valid is LOW..HIGH with LOW below HIGH")
@@ -186,7 +186,7 @@ def _range(path: str, ends: str, default: Any, where: str) -> Range:
 
 
 def _steps(parts: Sequence[str], most: int, where: str) -> list[float]:
-    """Numbers from START to STOP by STEP, exact as decimals are."""
+    """Return the numbers from START to STOP by STEP, without rounding errors of decimal steps."""
     valid = "valid is START:STOP:STEP with START not above STOP, and STEP above 0"
     if len(parts) != 3 or None in map(_number, parts):
         raise ConfigError(f"{where}: {valid}")
@@ -204,7 +204,7 @@ def _steps(parts: Sequence[str], most: int, where: str) -> list[float]:
 
 
 def _number(text: str) -> float | None:
-    """The number that a text holds; None if it is none."""
+    """Parse a number; None if the text is not a number."""
     try:
         return parse_number(text)
     except ValueError:
@@ -216,7 +216,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _fractions(values: Sequence[Any], default: Any) -> tuple[Any, ...]:
-    """Values as fractions if all are numbers, and one of them or what the field holds is one."""
+    """Convert numbers to floats if one of them, or the value in the field, is a float."""
     is_fraction = any(isinstance(value, float) for value in (*values, default))
     if is_fraction and all(map(_is_number, values)):
         return tuple(map(float, values))
