@@ -1,8 +1,9 @@
-"""Known optimum: a bound on what any controller can reach, and a plan that the simulator has run.
+"""Known optimum: a bound that no controller can beat, and a plan whose result is simulated.
 
-A table of what each step costs, made by the simulator itself, turns the control of a data center
-into linear programmes and dynamic programmes. Their optimum bounds the figure of every controller
-that knows the inputs in advance; the plan behind it is then run to see what can be achieved.
+The simulator tabulates the cost of each step by utilisation and setpoint. With this table the
+control of a data center becomes a problem for linear and dynamic programming. The optimum of these
+programmes bounds the objective of every controller, even one that knows all inputs in advance. The
+simulator then runs a plan close to the optimum, which shows how much is achievable.
 """
 
 from sdc_taichi.optimum.objective import Objective

@@ -1,4 +1,4 @@
-"""Entries of the cache of optima, one file for each data center."""
+"""Cache of optima on disk, with one file for each data center."""
 
 from __future__ import annotations
 
@@ -21,48 +21,51 @@ from sdc_taichi.types import F64
 
 _X = TypeVar("_X")
 METHOD = 1
-"""Version of how optima are found; files of another one are not read."""
+"""Version of the solution method. Cached files of other versions are not used."""
 _TEXT = ("fingerprint", "alone", "kind", "failures", "certificate")
 
 
 class OptimumCacheWarning(SdcWarning):
-    """A kept optimum cannot be used or kept."""
+    """Warning that a cached optimum cannot be read, or that an optimum cannot be cached."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Optimum of one data center over T steps, as the cache keeps it."""
+    """Cached optimum of one data center for a run of T steps.
+
+    Figures are values of the objective; smaller figures are better.
+    """
 
     idle: float
     """Figure under idle commands."""
     idle_dropped_tasks: float
-    """Work that finds the queue full under idle commands, in tasks."""
+    """Work that is dropped because the queue is full under idle commands, in tasks."""
     bound: float
-    """Bound of the figure; nan without one."""
+    """Lower bound of the figure; nan if there is none."""
     achieved: float
-    """Lowest figure that the simulator reached."""
+    """Lowest figure of the simulated plans that satisfy the constraints."""
     alone: Mapping[str, float]
-    """Lowest figure reached with one agent alone, by its name."""
+    """Lowest figure of simulated plans that move one agent alone, by agent."""
     kind: str
-    """Kind of the bound: ``bound``, or ``estimate: `` or ``none: `` and why."""
+    """Kind of the bound: ``bound``, or ``estimate: `` or ``none: `` followed by the reason."""
     failures: tuple[str, ...]
-    """Certificates that do not hold, in words."""
+    """Constraints that simulated plans break, in words."""
     certificate: Mapping[str, float]
-    """Measurements of the simulator along the achieved path, by name."""
+    """Measurements of the simulator for the best plan, by name."""
     load: F64
-    """Load commands of the achieved path, (T,)."""
+    """Load commands of the best plan, (T,)."""
     cooling: F64
-    """Cooling commands of the achieved path, in steps of the setpoint, (T,)."""
+    """Cooling commands of the best plan, in steps of the setpoint, (T,)."""
     battery: F64
-    """Battery commands of the achieved path, (T,)."""
+    """Battery commands of the best plan, (T,)."""
 
 
 def key_of(fingerprint: str, arguments: Mapping[str, Any]) -> str:
-    """SHA-256 of everything that decides an entry.
+    """Return the SHA-256 of everything that determines a cache entry.
 
     Args:
-        fingerprint: Of the data center's config, inputs and precision.
-        arguments: Everything else that decides it, as values that JSON can hold.
+        fingerprint: Fingerprint of the data center's config, inputs and precision.
+        arguments: All other arguments of the optimisation, as values that JSON can represent.
     """
     versions = {name: version(name) for name in ("sdc-taichi", "scipy", "numpy")}
     text = json.dumps([METHOD, versions, fingerprint, arguments], sort_keys=True)
@@ -70,23 +73,23 @@ def key_of(fingerprint: str, arguments: Mapping[str, Any]) -> str:
 
 
 class Cache:
-    """Kept entries, one file each, in the folder of the user's caches.
+    """Reads and writes cached optima, one file per entry.
 
-    A file that is damaged or of other inputs is computed anew, and a folder that cannot be written
-    keeps nothing, each with an ``OptimumCacheWarning``.
+    A file that is damaged or belongs to other inputs is ignored, and nothing is stored in a folder
+    without write permission. Both cases give an ``OptimumCacheWarning``.
 
     Args:
-        folder: Folder of the files; None is ``usual_folder``.
+        folder: Folder of the files; None means ``usual_folder``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = usual_folder() if folder is None else folder.absolute()
 
     def find(self, key: str, steps: int) -> Entry | None:
-        """The entry of a key; None where there is none that can be used.
+        """Return the entry of a key, or None if there is no usable entry.
 
         Args:
-            key: Key of ``key_of``.
+            key: Key from ``key_of``.
             steps: Number of steps, T.
         """
         return self._read(
@@ -94,14 +97,14 @@ class Cache:
         )
 
     def keep(self, key: str, entry: Entry) -> None:
-        """Keep an entry, whole or not at all."""
+        """Write an entry atomically."""
         self._write(self._path(key), _to_arrays(entry, key))
 
     def find_ends(self, key: str) -> dict[Ends, float]:
-        """Bounds with given ends that are kept under a key.
+        """Return the cached bounds of a key, by the states at start and end of the run.
 
         Args:
-            key: Key of ``key_of``.
+            key: Key from ``key_of``.
         """
 
         def figures(arrays: Mapping[str, Any]) -> dict[Ends, float]:
@@ -113,18 +116,18 @@ class Cache:
         return self._read(self._path(f"{key}-ends"), figures, "bounds of ends are") or {}
 
     def keep_ends(self, key: str, figures: Mapping[Ends, float]) -> None:
-        """Keep bounds with given ends, whole or not at all.
+        """Write bounds atomically, by the states at start and end of the run.
 
         Args:
-            key: Key of ``key_of``.
-            figures: The bounds.
+            key: Key from ``key_of``.
+            figures: Bounds by ``Ends``.
         """
         ends = np.array([astuple(each) for each in figures])
         values = {"fingerprint": key, "ends": ends, "figures": np.array([*figures.values()])}
         self._write(self._path(f"{key}-ends"), values)
 
     def _read(self, path: Path, parse: Callable[[Mapping[str, Any]], _X], what: str) -> _X | None:
-        """Content of a file; None, with a warning, where it is damaged."""
+        """Return the content of a file, or None if it is missing or, with a warning, damaged."""
         if not path.is_file():
             return None
         try:
@@ -135,12 +138,12 @@ class Cache:
 
     def _write(self, path: Path, values: Mapping[str, Any]) -> None:
         try:
-            if not path.is_absolute():  # the system knows no home of this user
+            if not path.is_absolute():  # The user has no home directory.
                 raise OSError("no absolute path")
             path.parent.mkdir(parents=True, exist_ok=True)
             snapshot.write(path, values)
         except ClaimedFileError:
-            pass  # another process has solved the same and is keeping it
+            pass  # Another process has solved the same problem and is writing this file.
         except (SdcError, OSError) as error:
             _warn(f"{printable(path.parent)}: optima are not kept ({error})")
 
@@ -149,24 +152,24 @@ class Cache:
 
 
 def usual_folder() -> Path:
-    """Folder in which optima are kept, among the user's caches."""
+    """Return the default folder of cached optima, inside the user's cache directory."""
     import platformdirs
 
     return Path(platformdirs.user_cache_dir("sdc-taichi", appauthor=False)) / "optimum"
 
 
 def _to_arrays(entry: Entry, key: str) -> dict[str, Any]:
-    """Arrays of an entry by name, with texts and dictionaries as JSON."""
+    """Convert an entry to arrays by name; text and dictionaries become one JSON string."""
     values = {f.name: getattr(entry, f.name) for f in fields(Entry)} | {"fingerprint": key}
     text = json.dumps({name: values.pop(name) for name in _TEXT}, default=dict)
     return {**values, "text": text}
 
 
 def _from_arrays(arrays: Mapping[str, Any], key: str, steps: int) -> Entry:
-    """The entry that a file holds.
+    """Convert the arrays of a file to an entry.
 
     Raises:
-        ValueError, TypeError, KeyError: It holds none, or that of another key.
+        ValueError, TypeError, KeyError: The arrays are no entry, or belong to another key.
     """
     values: dict[str, Any] = json.loads(str(arrays["text"]))
     if values.pop("fingerprint") != key:

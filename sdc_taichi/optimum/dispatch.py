@@ -1,8 +1,8 @@
-"""The linear programme of load, battery and demand charges of one data center over some steps.
+"""Linear programme of load, battery and demand charges of one data center.
 
-Variables of step t: the use of each segment of the cost curve, energy charged c and discharged x,
-energy stored b, work that waits Q, and D, all work deferred since the first step. With arriving
-work A, work done e, and N steps to the deadline, the rows are
+The variables of step t are the use of each segment of the cost curve, charged energy c, discharged
+energy x, stored energy b, waiting work Q, and D, the total work deferred since the first step. With
+arriving work A, executed work e, and N steps to the deadline, the constraints (rows) are
 
     Q_t = Q_(t-1) + A_t - e_t - dropped_t        D_t - D_(t-1) <= min(most deferred, Q_t)
     Q_t <= D_t - D_(t-N)                         b_t = b_(t-1) + eta_c*c_t - eta_d*x_t
@@ -10,19 +10,21 @@ work A, work done e, and N steps to the deadline, the rows are
     x_t <= F_t(e_t)                              c_t + F_t(e_t) <= grid limit, largest F_t
     F_t(e_t) + c_t - x_t <= step_h * peak of the month
 
-Whatever a controller does in the simulator keeps these rows, or is no cheaper than something that
-does, so their optimum is a bound:
+Every sequence of commands in the simulator satisfies these rows, or costs at least as much as a
+sequence that does. Their optimum is therefore a bound, for three reasons:
 
-- Work that waits after step t entered within the last N steps, since older work is due and runs;
-  what entered is at most what may be deferred, and no more than waits if what leaves is taken as
-  it was before the step. Rows let work leave and enter at once, which a first-in-first-out queue
-  does for due work alone.
-- F_t is the least energy of the facility over setpoints, below which none can come, and its convex
-  curve is lower still. A discharge is at most the energy of the facility at the setpoint that was
-  chosen. Cut to F_t it leaves more in the store, which costs nothing to waste by charging less
-  later, and the energy bought is no higher: F + c - x with x <= F is at least c. With a weight on
-  water, the cheapest setpoint may not be that of F_t, and the row has the largest F instead.
-- At weights of 0 or more, charging and discharging at once is allowed but never pays.
+- Work that waits after step t entered the queue within the last N steps, because older work is due
+  and is executed. The work that enters in a step is at most the work that may be deferred, and at
+  most the work that waits afterwards. The rows allow work to leave and to enter in the same step,
+  whereas a first-in-first-out queue does so only for due work.
+- F_t is a convex curve below the smallest energy of the facility at any setpoint, so no controller
+  needs less energy than F_t. In the simulator, a discharge is at most the energy of the facility at
+  the chosen setpoint. If a discharge exceeds F_t, reduce it to F_t: the battery then stores more,
+  which a smaller charge later compensates, and no more energy is bought, because F + c - x with
+  x <= F is at least c. If water has a weight, the cheapest setpoint may differ from that of F_t, so
+  the row uses the largest F instead.
+- The rows allow charging and discharging in the same step. With weights of at least 0 this never
+  lowers the cost.
 """
 
 from __future__ import annotations
@@ -39,75 +41,78 @@ from sdc_taichi.plant.battery import BATTERIES, BatteryPoint
 from sdc_taichi.types import F64, I64
 
 DEFER, DRAIN, DUE = -1, 1, 0
-"""Mode of a step of a plan: work enters the queue, leaves it, or due work leaves it."""
+"""Mode of a step in a plan: work only enters the queue (DEFER), work only leaves it (DRAIN), or
+exactly the due work leaves while other work may enter (DUE)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Some steps of a problem, what they start from, and what they have to leave."""
+    """A range of steps of a planning problem, with conditions on the start and end states."""
 
     first: int
-    """First of the steps."""
+    """Number of the first step."""
     end: int
-    """First step after them."""
+    """Number of the first step after the range."""
     start_kwh: float | None = None
-    """Energy stored before the first, in kWh; None is any."""
+    """Energy stored before the first step, in kWh; None allows any value."""
     start_tasks: float | None = None
-    """Work that waits before the first, in tasks; None is any."""
+    """Work that waits before the first step, in tasks; None allows any value."""
     deferred_before: F64 | None = None
-    """Work that was deferred in each step of a deadline before the first, oldest first, in tasks,
-    (N,); None where the age of work that waits is not known."""
+    """Work deferred in each of the N steps before the first step, oldest first, in tasks, (N,). N
+    is the deadline in steps. None means that the age of the waiting work is unknown."""
     end_kwh: float | None = None
-    """Least energy stored after the last, in kWh; None is any."""
+    """Minimum energy stored after the last step, in kWh; None allows any value."""
     end_tasks: float | None = None
-    """Most work that waits after the last, in tasks; None is any."""
+    """Maximum work that waits after the last step, in tasks; None allows any value."""
     least_peaks_kw: tuple[float, ...] = ()
-    """Least power of each month that is charged for, in kW; 0 of all where it is empty."""
+    """Minimum billed power of each month, in kW; an empty tuple means 0 for all months."""
     as_after: int | None = None
-    """Step, of all T, whose state at its end the last has to keep; None is none."""
+    """Number of a step whose end state is a condition on the end of the range: at least its stored
+    energy and at most its waiting work. None means no such condition."""
     state_values: tuple[tuple[int, float, float], ...] = ()
-    """Steps, of all T, and what each task that waits and each kWh stored at their end costs;
-    ``first - 1`` is the start."""
+    """Costs of states at the end of steps: number of the step, cost per waiting task, cost per
+    stored kWh. Step ``first - 1`` stands for the state at the start."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dispatch:
-    """Least cost of some steps and how it is reached."""
+    """Minimum cost of n steps, with the work and the battery use that give this cost."""
 
     figure: float
-    """Weighed cost of the steps, their peaks and the values of states."""
+    """Weighted cost of the steps, including demand charges and the costs of states."""
     executed_tasks: F64
-    """Work that is done, in tasks, (n,)."""
+    """Work executed in each step, in tasks, (n,)."""
     waiting_tasks: F64
     """Work that waits at the end of each step, in tasks, (n,)."""
     deferred_tasks: F64
-    """Work that enters the queue, in tasks, (n,); what waits more where there is no deadline."""
+    """Work that enters the queue in each step, in tasks, (n,); without a deadline, the increase of
+    the queue."""
     charge_kwh: F64
-    """Energy charged, in kWh, (n,)."""
+    """Energy charged in each step, in kWh, (n,)."""
     discharge_kwh: F64
-    """Energy discharged, in kWh, (n,)."""
+    """Energy discharged in each step, in kWh, (n,)."""
     stored_kwh: F64
     """Energy stored at the end of each step, in kWh, (n,)."""
     task_price: F64
-    """What one task more that waits at the end of each step adds to the figure, (n,)."""
+    """Rise of the figure per additional task that waits at the end of a step, (n,)."""
     kwh_price: F64
-    """What one kWh more stored at the end of each step takes off the figure, (n,)."""
+    """Fall of the figure per additional kWh stored at the end of a step, (n,)."""
     end_task_price: float
-    """What one task fewer to leave at the end adds, where that follows an earlier step."""
+    """Rise of the figure per task by which the condition ``Span.as_after`` is tightened."""
     end_kwh_price: float
-    """What one kWh more to leave at the end adds, where that follows an earlier step."""
+    """Rise of the figure per kWh by which the condition ``Span.as_after`` is tightened."""
     peaks_kw: tuple[float, ...]
-    """Power of each month that is charged for, in kW."""
+    """Billed power of each month with a demand charge, in kW."""
 
 
 class DispatchProgramme:
-    """The linear programme of some steps.
+    """Linear programme of a range of n steps.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
-        curves: Cost and energy of its steps by the work done.
-        span: The steps.
+        stage: Minimum cost of each step by the executed work.
+        curves: Convex curves of cost and energy of each step by the executed work.
+        span: Range of steps, with conditions on the states at its start and end.
     """
 
     def __init__(self, problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> None:
@@ -140,22 +145,22 @@ class DispatchProgramme:
         return self._entered - (self._queue - self._queue.before(self._start_tasks))
 
     def add_deferral_weight(self, weight: F64) -> None:
-        """Weigh each task that enters the queue, as a hint and not a cost, (n,)."""
+        """Add a small cost per task that enters the queue, (n,), to choose among equal plans."""
         if self._entered is None:
             return
         self._programme.add_cost("deferred", weight - np.append(weight[1:], 0.0))
-        # Without a weight more may always enter, so the bound does without these rows.
+        # These rows are needed only with a weight: without it, additional work may always enter.
         self._programme.at_most("entered", 0.0, self._entered)
         self._programme.at_most("left", 0.0, self._left)
 
     def keep_modes(self, modes: I64) -> None:
-        """Let work enter and leave as a first-in-first-out queue can do it.
+        """Restrict work to movements that a first-in-first-out queue can perform.
 
-        A step with mode DEFER takes nothing out, one with DRAIN puts nothing in, and one with DUE
-        takes out what is due and no more.
+        In a step of mode DEFER no work leaves the queue, in a step of mode DRAIN no work enters,
+        and in a step of mode DUE exactly the due work leaves.
 
         Args:
-            modes: DEFER, DRAIN or DUE, (n,).
+            modes: Mode of each step, (n,).
         """
         if self._entered is None:
             return
@@ -166,8 +171,8 @@ class DispatchProgramme:
         p.at_most("drained", 0.0, left[drain])
         p.at_most("run", 0.0, left[due])
         if self._problem.work.model == "tasks":
-            # Except for due work, a queue falls by no more than the flexible work of its step, and
-            # in a step with due work no work is taken back that was deferred.
+            # In model ``tasks``, a queue without due work falls by at most the flexible work of the
+            # step, and a step with due work takes back no deferred work.
             most = self._problem.work.most_deferred_tasks[self._steps]
             fall, others = self._queue.before(self._start_tasks) - self._queue, modes != DUE
             p.at_most("drain_limit", fall[others], most[others])
@@ -175,10 +180,10 @@ class DispatchProgramme:
         p.equal("due", self._queue[due], self._within_deadline[due])
 
     def solve(self) -> Dispatch:
-        """Find the least cost of the steps, and how it is reached.
+        """Solve the linear programme for the minimum cost of the steps.
 
         Raises:
-            InfeasibleError: Nothing satisfies all rows.
+            InfeasibleError: No values of the variables satisfy all rows.
         """
         solution, none = self._programme.solve(), np.zeros(self._size)
         waiting = solution.of(self._queue)
@@ -204,10 +209,10 @@ class DispatchProgramme:
         )
 
     def _add_segments(self, curves: LoadCurves) -> tuple[Linear, Linear]:
-        """Add the use of each segment of the cost curves.
+        """Add variables for the use of each segment of the cost curves, in tasks.
 
         Returns:
-            Work done in each step, in tasks, and energy of the facility, in kWh, (n,) each.
+            Executed work of each step, in tasks, and energy of the facility, in kWh, (n,) each.
         """
         from scipy import sparse
 
@@ -222,7 +227,7 @@ class DispatchProgramme:
         )
 
         def by_step(value: F64) -> Linear:
-            """Sum over the segments of each step of a value times the use of the segment."""
+            """Return the sum of value times use over the segments of each step, (n,)."""
             at = (curves.step[part] - self._span.first, np.arange(size))
             matrix = sparse.csr_array((value, at), shape=(self._size, size))
             return Linear(np.zeros(self._size), {"segments": matrix})
@@ -230,7 +235,7 @@ class DispatchProgramme:
         return executed + by_step(np.ones(size)), energy_kwh + by_step(curves.slope_kwh[part])
 
     def _add_queue(self) -> None:
-        """Add work that waits, its limits and its deadline."""
+        """Add the waiting work of each step, with queue limit and deadline."""
         span, work, n, p = self._span, self._problem.work, self._size, self._programme
         arrived, limit = work.arrived_tasks[self._steps], work.queue_limit_tasks
         upper = np.full(n, limit)
@@ -261,23 +266,23 @@ class DispatchProgramme:
         self._entered = deferred - deferred.before(0.0)
         p.at_most("entry", self._entered, work.most_deferred_tasks[self._steps])
         p.at_most("kept", self._entered, self._queue)
-        # Without a record of what entered before the first step, its age is not known.
+        # If the age of the initial queue is unknown, the deadline holds only after N steps.
         first = work.deadline_steps if span.deferred_before is None else 0
         aged = np.arange(first, n)
         self._within_deadline = self._deferred_within(work.deadline_steps, deferred)
         p.at_most("deadline", self._queue[aged], self._within_deadline[aged])
 
     def _deferred_within(self, steps: int, deferred: Linear) -> Linear:
-        """Work that entered the queue in the last ``steps`` steps up to each step, (n,)."""
+        """Return the work that entered the queue in the ``steps`` steps up to each step, (n,)."""
         earlier, before = np.zeros(self._size), self._span.deferred_before
         if before is not None:
-            # Of the work deferred before the first step, what is still within its deadline.
+            # Work deferred before the first step whose deadline has not come yet.
             within = np.cumsum(before[::-1])[::-1][1:]
             earlier[: steps - 1] = within[: self._size]
         return deferred - deferred.shifted(steps) + earlier
 
     def _add_battery(self, stage: StageCost) -> None:
-        """Add charge, discharge, energy stored, and what limits them."""
+        """Add charged, discharged and stored energy of each step, with their limits."""
         problem, span, p, n = self._problem, self._span, self._programme, self._size
         storage, weight = problem.storage, problem.kwh_weight[self._steps]
         start = storage.stored_kwh if span.start_kwh is None else span.start_kwh
@@ -318,7 +323,7 @@ class DispatchProgramme:
         self._charge, self._discharge, self._stored = charge, discharge, stored
 
     def _add_peaks(self) -> None:
-        """Add the highest power of each month."""
+        """Add the highest power of each month, with its demand charge as cost."""
         span = self._span
         bought_kwh = self._energy_kwh + self._charge - self._discharge
         for k, month in enumerate(self._problem.months):
@@ -332,7 +337,7 @@ class DispatchProgramme:
             self._programme.at_most(name, bought_kwh[rows], self._problem.step_h * peak_kw)
 
     def _net_battery(self, solution: Solution) -> tuple[F64, F64]:
-        """Charge and discharge, of which one is 0 in each step, with the same energy stored."""
+        """Return charge and discharge with the same stored energy, one of them 0 in each step."""
         charge, discharge = solution.of(self._charge), solution.of(self._discharge)
         if not self._has_battery:
             return charge, discharge
@@ -343,7 +348,7 @@ class DispatchProgramme:
         return np.maximum(gain, 0.0) / eta_c, np.maximum(-gain, 0.0) / eta_d
 
     def _values(self, *, tasks: bool) -> F64:
-        """Cost of a task that waits, or of a kWh stored, at the end of each step, (n,)."""
+        """Return the cost per waiting task, or per stored kWh, at the end of each step, (n,)."""
         cost = np.zeros(self._size)
         for step, task, kwh in self._span.state_values:
             if step >= self._span.first:
@@ -351,57 +356,59 @@ class DispatchProgramme:
         return cost
 
     def _start_value(self, *, tasks: bool) -> float:
-        """Cost of a task that waits, or of a kWh stored, before the first step."""
+        """Return the cost per waiting task, or per stored kWh, before the first step."""
         before = self._span.first - 1
         values = self._span.state_values
         return sum(task if tasks else kwh for step, task, kwh in values if step == before)
 
 
 def _peak_name(month: int) -> str:
-    """Name of the variable and the rows of the highest power of a month, by its number."""
+    """Return the name of the variable and of the rows for the highest power of a month."""
     return f"peak_{month}"
 
 
 Line = tuple[float, float]
-"""A limit in kWh of an empty battery, and its rise with each kWh stored."""
+"""A linear limit in kWh: its value for an empty battery, and its slope per stored kWh."""
 
 _STATES = 2001
-"""States of charge at which the ``released`` battery is sampled."""
+"""Number of states of charge at which the ``released`` battery model is sampled."""
 _ROUNDING_KWH = 5e-6
-"""Most that the ``released`` battery gains in a step by rounding, in kWh."""
+"""Maximum energy that the ``released`` battery gains in a step by rounding, in kWh."""
 _UNLIMITED_KW = 1e12
-"""Load that never limits a discharge, in kW."""
+"""Load that is too large to limit any discharge, in kW."""
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryLimits:
-    """Limits of a battery in a step, each the least of linear functions of the energy stored."""
+    """Limits of the energy that a battery charges or discharges in a step.
+
+    Each limit is the minimum of linear functions of the stored energy.
+    """
 
     charge_efficiency: float
-    """Energy stored per energy drawn."""
+    """Ratio of stored energy to energy drawn."""
     discharge_factor: float
-    """Energy taken from the store per energy delivered."""
+    """Ratio of energy taken from the store to energy delivered."""
     charge: tuple[Line, ...]
-    """Limits of the energy charged."""
+    """Linear upper limits of the charged energy."""
     discharge: tuple[Line, ...]
-    """Limits of the energy discharged."""
+    """Linear upper limits of the discharged energy."""
     most_charge_kwh: float
-    """Most energy charged at any energy stored, in kWh."""
+    """Maximum charged energy at any stored energy, in kWh."""
     most_discharge_kwh: float
-    """Most energy discharged at any energy stored, in kWh."""
+    """Maximum discharged energy at any stored energy, in kWh."""
     discharge_load_share: float
-    """Largest ratio of the energy discharged to the energy of the facility."""
+    """Maximum ratio of the discharged energy to the energy of the facility."""
     rounding_kwh: float
-    """Energy that a step may gain by rounding, in kWh."""
+    """Maximum energy that a step may gain by rounding, in kWh."""
 
 
 @lru_cache(maxsize=256)
 def battery_limits(storage: Storage, step_h: float, start_kwh: float) -> BatteryLimits:
-    """Linear limits of a battery that hold at every energy it can have stored.
+    """Return linear limits that contain everything that a battery model can do in a step.
 
-    The limits of ``clc`` and ``paper`` are linear themselves (``plant.battery``). Those of
-    ``released`` depend on the state of charge in other ways; here they are the least concave curve
-    above them, so a battery within these limits does all that the model does, and more.
+    The limits of the models ``clc`` and ``paper`` are linear (``plant.battery``). Those of
+    ``released`` are nonlinear in the state of charge and are replaced by lines above them.
 
     Args:
         storage: The battery.
@@ -419,7 +426,7 @@ def battery_limits(storage: Storage, step_h: float, start_kwh: float) -> Battery
         most_c, most_d = storage.charge_limit_c_rate / eta_c, storage.discharge_limit_c_rate / eta_d
         upper, lower = storage.upper_v * capacity, storage.lower_v * capacity
         rise_c, rise_d = -storage.upper_u_h, storage.lower_u_h
-    # A battery that starts beyond these limits stays there until it is used.
+    # The initial stored energy may be outside these limits until a command moves the battery.
     upper, lower = max(upper, start_kwh), min(lower, start_kwh)
     in_h, out_h = eta_c * step_h + rise_c, eta_d * step_h + rise_d
     return BatteryLimits(
@@ -435,14 +442,14 @@ def battery_limits(storage: Storage, step_h: float, start_kwh: float) -> Battery
 
 
 def _released(capacity_kwh: float, step_h: float) -> BatteryLimits:
-    """Limits of the ``released`` battery: the least concave curves above it."""
+    """Return linear limits above the nonlinear limits of the ``released`` battery."""
     stored = np.linspace(0.0, capacity_kwh, _STATES)
     energy = {}
     for name, command in (("charge", 1.0), ("discharge", -1.0)):
         point = BatteryPoint(capacity_kwh, _UNLIMITED_KW, step_h)
         step = BATTERIES["released"].step(stored, command, point)
         energy[name] = np.asarray(getattr(step, f"{name}_kwh"))
-    # The load carries a quarter of its power over a duration that depends on the state of charge.
+    # A small load limits the discharge to a share of the load that depends on the stored energy.
     point = BatteryPoint(capacity_kwh, 1e-6 * capacity_kwh, step_h)
     light = BATTERIES["released"].step(stored, -1.0, point)
     share = float(np.max(light.discharge_kwh) / (1e-6 * capacity_kwh * step_h))
@@ -459,9 +466,11 @@ def _released(capacity_kwh: float, step_h: float) -> BatteryLimits:
 
 
 def _lines_above(x: F64, y: F64, count: int = 6) -> tuple[Line, ...]:
-    """Lines whose least is above a curve: some edges of its upper hull, raised above all points.
+    """Return up to ``count`` lines whose minimum is above a sampled curve.
 
-    Between samples the curve rises above its chords by no more than the largest second difference.
+    The lines are edges of the curve's upper convex hull, raised above all samples. Between two
+    samples, the curve exceeds its chord by at most the largest second difference, which is added as
+    a margin.
     """
     corners = [0]
     for i in range(1, len(x)):

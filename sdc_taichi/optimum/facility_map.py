@@ -1,7 +1,7 @@
-"""Energy of a step by weather, utilisation and setpoint, for plans on forecast weather.
+"""Maps of a step's energy by weather, utilisation and setpoint, for plans with forecast weather.
 
-A table holds the weather of each step. A forecast may be wrong, so a map has nodes throughout the
-weather of the year and is interpolated linearly between them.
+A ``FacilityTable`` covers only the actual weather of each step. Forecast weather may differ from
+it, so a map has nodes throughout the weather of the year and interpolates linearly between them.
 """
 
 from __future__ import annotations
@@ -30,58 +30,65 @@ from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64
 
 MARGIN_K = 5.0
-"""Distance by which a map extends beyond the weather of the year, for forecasts that err, in K."""
+"""Margin of a map beyond the extreme weather of the year, for wrong forecasts, in K."""
 _FEW = 4
-"""Number of nodes of the wet-bulb depression (dry bulb minus wet bulb), on which towers and dry
-coolers hardly depend. Plants that let outdoor air in switch by its humidity, and have nodes as
-close as those of the dry bulb."""
+"""Number of nodes of the wet-bulb depression (dry bulb minus wet bulb) for towers and dry coolers.
+
+Their energy hardly depends on the depression. Air-side plants switch modes by outdoor humidity, so
+their depression nodes have the same spacing as those of the dry bulb.
+"""
 
 
 _BARRED = 1e6
-"""Factor by which the energy of a barred setpoint exceeds that of the dearest one."""
+"""Factor by which a setpoint that is not allowed counts as dearer than the dearest setpoint."""
 
 
 @dataclass(frozen=True, slots=True)
 class FacilityMap:
-    """Energy of a step of B data centers, M of which differ, by weather, load and setpoint.
+    """Energy of a step by weather, utilisation and setpoint, for B data centers with M maps.
 
-    The first axis of the weather is the wet bulb where heat goes to a tower, else the dry bulb; the
-    second is the dry bulb less the wet bulb. Weather beyond the nodes is read at the last ones.
+    The first weather axis, with W nodes, is the wet bulb for plants with a tower, and the dry bulb
+    for all others. The second axis, with P nodes, is the wet-bulb depression, dry bulb minus wet
+    bulb. Weather outside the nodes counts as that of the nearest node.
     """
 
     which: I64
-    """Entry of each data center among those that differ, (B,)."""
+    """Index of each data center's map among the M distinct maps, (B,)."""
     by_wet_bulb: bool
-    """Whether the first axis of the weather is the wet bulb."""
+    """True if the first weather axis is the wet bulb, False if it is the dry bulb."""
     first_c: F64
-    """First node of the first axis, in C, (M,)."""
+    """First node of the first weather axis, in C, (M,)."""
     last_c: F64
-    """Last node of the first axis that is a data center's own, in C, (M,)."""
+    """Last node of the first weather axis that a map needs, in C, (M,). Later nodes only pad the
+    array."""
     step_k: float
-    """Distance of its nodes, in K."""
+    """Spacing of the nodes of the first weather axis, in K."""
     depression_step_k: F64
-    """Distance of the nodes of dry bulb less wet bulb, the first of which is 0, in K, (M,)."""
+    """Spacing of the nodes of wet-bulb depression (dry bulb minus wet bulb, first node 0), in K,
+    (M,)."""
     last_depression_k: F64
-    """Last of these nodes that is a data center's own, in K, (M,)."""
+    """Last node of wet-bulb depression that a map needs, in K, (M,). Later nodes only pad the
+    array."""
     utilisation: F64
-    """Utilisations, evenly from 0 to 1, (I,)."""
+    """Utilisations, equally spaced from 0 to 1, (I,)."""
     setpoint_c: F64
-    """Setpoints, rising in equal steps to the highest, which fills what is left, in C, (M, J)."""
+    """Setpoints, increasing in equal steps, in C, (M, J). Maps with fewer than J setpoints repeat
+    the highest one."""
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (M, W, P, I, J)."""
     allowed: Mask
-    """Whether a plan may choose a setpoint: its hottest inlet is within the limit and it leaves no
-    heat in the room, or no setpoint does better, (M, W, P, I, J)."""
+    """True if a plan may choose a setpoint, (M, W, P, I, J): its hottest inlet is within the limit
+    and no heat remains in the room, or no other setpoint is better in this respect."""
     least_kwh: F64 = field(init=False)
-    """Least energy among the setpoints that are allowed, in kWh, (M, W, P, I)."""
+    """Minimum energy of the allowed setpoints, in kWh, (M, W, P, I)."""
 
     def __post_init__(self) -> None:
-        """Find the least energy among setpoints."""
+        """Compute the minimum energy of the allowed setpoints."""
         least_kwh = np.where(self.allowed, self.facility_kwh, np.inf).min(axis=-1)
         object.__setattr__(self, "least_kwh", least_kwh)
 
     def best_setpoint_c(self, utilisation: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
-        """The setpoint of least energy among the nodes that are allowed, in C, (B, H).
+        """Return the allowed setpoint with the lowest energy in each of H steps, in C, (B, H).
 
         Args:
             utilisation: Utilisation, 0..1, (B, H).
@@ -91,7 +98,7 @@ class FacilityMap:
         places = self.places_of_weather(outdoor_c, wet_bulb_c)
         kwh = self._in_weather(self.facility_kwh, *places)
         bars = self._in_weather(np.where(self.allowed, 0.0, 1.0), *places)
-        # A number, so that shares of nodes can be taken of it.
+        # The penalty is finite because infinite values cannot be interpolated between nodes.
         kwh += _BARRED * (1.0 + kwh.max(axis=-1, keepdims=True)) * (bars > 0.0)
         intervals = len(self.utilisation) - 1
         low, share = _place(utilisation * intervals, intervals + 1)
@@ -102,7 +109,7 @@ class FacilityMap:
         return np.asarray(np.take_along_axis(self.setpoint_c[self.which], best, axis=1))
 
     def places_of_weather(self, outdoor_c: F64, wet_bulb_c: F64) -> tuple[F64, F64]:
-        """Places of the weather on the two axes, counted in nodes, each (B, H).
+        """Return fractional node indices of the weather on both axes, (B, H) each.
 
         Args:
             outdoor_c: Dry bulb, in C, (B, H).
@@ -118,7 +125,7 @@ class FacilityMap:
         )
 
     def _in_weather(self, values: F64, lead: F64, depression: F64) -> F64:
-        """Values at places of the weather, (B, H, ...), from those at nodes, (M, W, P, ...)."""
+        """Interpolate values at weather nodes, (M, W, P, ...), at node indices, to (B, H, ...)."""
         wet, dry = values.shape[1:3]
         low, share = _place(lead, wet)
         low_k, share_k = _place(depression, dry)
@@ -133,7 +140,7 @@ class FacilityMap:
         return found
 
     def at_own_nodes(self, values: NDArray[Any]) -> list[NDArray[Any]]:
-        """Values of each entry without nodes of weather that only other entries need, M of them.
+        """Return the values of each of the M maps without weather nodes that only pad the array.
 
         Args:
             values: Values at all nodes, (M, W, P, ...).
@@ -143,7 +150,7 @@ class FacilityMap:
         return [each[:w, :d] for each, w, d in zip(values, wet, dry, strict=True)]
 
     def places_of_setpoints(self, setpoint_c: F64) -> tuple[I64, F64]:
-        """Node below each setpoint, and its share of the way to the next, each (B, H)."""
+        """Return the node below each setpoint, and the fraction to the next node, (B, H) each."""
         nodes_c = self.setpoint_c[self.which]
         step_k = nodes_c[:, 1:2] - nodes_c[:, :1] if nodes_c.shape[1] > 1 else np.zeros(1)
         within_c = np.clip(setpoint_c, nodes_c[:, :1], nodes_c[:, -1:])
@@ -162,21 +169,21 @@ def facility_map(
     setpoint_step_k: float = 1.0,
     precision: Precision = "f32",
 ) -> FacilityMap:
-    """Map of the data centers of a fleet over the weather of their year.
+    """Compute the map of each data center of a fleet for the weather of its year.
 
     Args:
-        fleet: B data centers. Events, thermal mass and protection are left out.
-        drivers: Their inputs, whose design temperatures size the devices.
-        inlet_limit_c: Highest inlet that a plan may cause where it has a choice, in C, (B,); inf
-            without a limit.
-        weather_step_k: Distance of the nodes of the first axis of the weather, in K.
-        margin_k: How far the map reaches beyond the weather of the year, in K.
-        utilisations: Number of utilisations, evenly from 0 to 1.
-        setpoint_step_k: Largest distance of setpoints, in K.
-        precision: Of the server kernels.
+        fleet: B data centers. Events, thermal mass and protection are ignored.
+        drivers: Inputs of the data centers. Their design temperatures determine device sizes.
+        inlet_limit_c: Highest inlet temperature that a plan may cause if another setpoint avoids
+            it, in C, (B,); inf without a limit.
+        weather_step_k: Spacing of the nodes of the first weather axis, in K.
+        margin_k: Margin of the map beyond the extreme weather of the year, in K.
+        utilisations: Number of utilisations, equally spaced from 0 to 1.
+        setpoint_step_k: Maximum spacing of setpoints, in K.
+        precision: Floating-point precision of the server kernels.
 
     Raises:
-        PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
+        PhysicalLimitError: A hall has no steady air state at some utilisation and setpoint.
     """
     by_wet_bulb = not PLANTS[fleet.models["plant"]].dry
     entries: dict[Hashable, int] = {}
@@ -190,7 +197,7 @@ def facility_map(
     levels = np.linspace(0.0, 1.0, utilisations)
     of_each = [setpoints_c(fleet.configs[dc], setpoint_step_k) for dc in dcs]
     setpoints = max(map(len, of_each))
-    # The highest setpoint is repeated to the number of all.
+    # Repeat the highest setpoint, so that all maps have the same number of setpoints.
     nodes = [
         Nodes(dc, levels, np.pad(x, (0, setpoints - len(x)), mode="edge"))
         for dc, x in zip(dcs, of_each, strict=True)
@@ -223,28 +230,39 @@ def facility_map(
 
 @dataclass(frozen=True, slots=True)
 class _WeatherNodes:
-    """Nodes of the weather of M data centers, W of the first axis and P of the second."""
+    """Weather nodes of the maps of M data centers, with W x P nodes on two axes.
+
+    The first axis is the wet bulb or the dry bulb, the second the wet-bulb depression.
+    """
 
     first_c: F64
-    """First node of the first axis, in C, (M,)."""
+    """First node of the first weather axis, in C, (M,)."""
     last_c: F64
-    """Last node of the first axis that is a data center's own, in C, (M,)."""
+    """Last node of the first weather axis that a map needs, in C, (M,)."""
     depression_step_k: F64
-    """Distance of the nodes of the second axis, in K, (M,)."""
+    """Spacing of the nodes of wet-bulb depression, in K, (M,)."""
     last_depression_k: F64
-    """Last node of the second axis that is a data center's own, in K, (M,)."""
+    """Last node of wet-bulb depression that a map needs, in K, (M,)."""
     shape: tuple[int, int]
-    """Numbers of nodes of the two axes, W and P."""
+    """Numbers of nodes of the two weather axes, W and P."""
     outdoor_c: F64
-    """Dry bulb of all pairs of nodes, in C, (M, W P)."""
+    """Dry bulb of all pairs of nodes, in C, (M, W * P)."""
     wet_bulb_c: F64
-    """Wet bulb of all pairs of nodes, in C, (M, W P)."""
+    """Wet bulb of all pairs of nodes, in C, (M, W * P)."""
 
 
 def _weather_nodes(
     low_c: F64, high_c: F64, most_k: F64, step_k: float, plant: str
 ) -> _WeatherNodes:
-    """Nodes from the lowest to the highest of the first axis, C, and to a depression, K, (M,)."""
+    """Compute the weather nodes of M maps.
+
+    Args:
+        low_c: Lowest value of the first weather axis, in C, (M,).
+        high_c: Highest value of the first weather axis, in C, (M,).
+        most_k: Largest wet-bulb depression, in K, (M,).
+        step_k: Spacing of the nodes of the first weather axis, in K.
+        plant: Name of the plant model.
+    """
     steps = np.maximum(np.ceil((high_c - low_c) / step_k), 1.0)
     few = np.full(len(low_c), _FEW - 1.0)
     depressions = np.maximum(np.ceil(most_k / step_k), few) if plant == "air_side" else few
@@ -267,7 +285,7 @@ def _weather_nodes(
 
 
 def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -> Hashable:
-    """Values that decide the map of a data center."""
+    """Return all values on which the map of a data center depends; equal values share a map."""
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, float(inlet_limit_c[dc])
@@ -276,7 +294,12 @@ def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -
 def _ranges(
     fleet: Fleet, drivers: Drivers, which: I64, by_wet_bulb: bool, margin_k: float
 ) -> tuple[F64, F64, F64]:
-    """Weather of the year: least and most of the first axis, C, most depression, K, each (M,)."""
+    """Compute the extreme weather of the year, with margins, for M maps.
+
+    Returns:
+        Minimum and maximum of the first weather axis, in C, and maximum wet-bulb depression, in K,
+        (M,) each.
+    """
     found: dict[int, tuple[float, float, float]] = {}
     for dc, entry in enumerate(which.tolist()):
         if entry not in found:
@@ -291,13 +314,13 @@ def _ranges(
 
 
 def _year_of(series: FleetSeries, dc: int, length: int) -> F64:
-    """The first values of one data center, (T,)."""
+    """Return the first ``length`` values of one data center's series, repeated if necessary."""
     places = int(series.offsets[dc]) + np.arange(length) % int(series.lengths[dc])
     return series.values.take(places)
 
 
 def _place(position: F64, nodes: int) -> tuple[I64, F64]:
-    """Node below a position, counted in nodes, and its share of the way to the next."""
+    """Split a fractional node index into the node below and the fraction to the next node."""
     within = np.clip(position, 0.0, nodes - 1)
     low = np.minimum(within.astype(np.int64), max(nodes - 2, 0))
     return low, within - low

@@ -1,19 +1,22 @@
-"""The bound of a planning problem, and a plan that queue and battery can carry out.
+"""Bound of a planning problem, and a plan that a real queue and a real battery can execute.
 
-Many weeks are bounded and planned window by window. The bound of all steps is at least the sum of
-the bounds of windows of steps, each with any state at its borders, of
+Runs of many weeks are divided into windows. In each window the states at both borders are free, and
+the objective is
 
-    cost of the steps - sum over borders of price * (state that the window leaves or starts from)
+    cost of the steps + price * (state at the start) - price * (state at the end),
 
-for any prices: the terms that the windows on both sides of a border add cancel (Lagrangian
-relaxation; A. M. Geoffrion, "Lagrangean relaxation for integer programming", Mathematical
-Programming Study 2 (1974)). The better the prices, the less is lost; here they are the dual prices
-of programmes that span the borders, without demand charges.
+where the price is the value of a stored kWh, or the negative cost of a waiting task.
+The sum of the windows' minima is a lower bound of the whole run for all prices, because the price
+terms of both sides of a border cancel (Lagrangian relaxation; A. M. Geoffrion, "Lagrangean
+relaxation for integer programming", Mathematical Programming Study 2 (1974)). Good prices make the
+bound tight. The prices used here are dual prices of programmes that contain the border, without
+demand charges.
 
-Where the last step has to keep the state of an earlier one, a price of at least 0 on the difference
-replaces the condition. Work that crosses a border loses its age, which can only lower the bound.
-A month in several windows is charged in each for its highest power there, with the window's share
-of the month as weight: the highest power of the month is at least this mean.
+If the end of the run must have the state of an earlier step, a price of at least 0 on the
+difference of both states replaces this condition. Work that crosses a border loses its age, which
+can only lower the bound. If a month extends to several windows, each window pays the demand charge
+of its own highest power, weighted by the window's share of the month. The highest power of the
+month is at least this weighted mean.
 """
 
 from __future__ import annotations
@@ -39,19 +42,21 @@ from sdc_taichi.optimum.stage_cost import (
 from sdc_taichi.types import I64
 
 _WARM_UP_SHARE = 1e-3
-"""Weight of steps that are not scored, relative to the others: enough for a reasonable plan, and
-so little that batteries are filled before the scored steps."""
+"""Weight of steps that are not scored, relative to scored steps. It is positive, so that their plan
+is reasonable, and small, so that batteries are filled before the scored steps."""
 _DEFERRAL_WEIGHT = 0.01
-"""Weight of a task that enters the queue, relative to the median cost of a task: just enough that
-work leaves the queue no earlier than it has to."""
+"""Weight of a task that enters the queue, relative to the median cost of a task. It breaks ties:
+work leaves the queue no earlier than necessary."""
 _LONGEST_BOUND = 3072
-"""Most steps of a bound's programme: a month of quarter hours. Time rises with their square."""
+"""Maximum number of steps in the programme of a bound, about a month of quarter hours. The solution
+time rises with the square of this number."""
 _LONGEST_PLAN = 672
-"""Most steps of a plan's programme: a week of quarter hours."""
+"""Maximum number of steps in the programme of a plan, a week of quarter hours."""
 _AROUND = 480
-"""Fewest steps on both sides of a border between windows from which its prices are computed."""
+"""Minimum number of steps on each side of a window border in the programme that gives its prices.
+"""
 _AHEAD = 192
-"""Fewest steps that the plan of a window looks ahead."""
+"""Minimum number of steps after a window that the window's plan takes into account."""
 _NEGLIGIBLE_TASKS = 1e-7
 """Amount of work below which a solver's result counts as zero, in tasks."""
 
@@ -59,23 +64,24 @@ _NEGLIGIBLE_TASKS = 1e-7
 def bound(
     problem: Problem, ends: Ends | None = None, *, check: Callable[[], None] = lambda: None
 ) -> Dispatch:
-    """Find a figure of the scored steps below which no controller can come.
+    """Compute a lower bound of the figure in the scored steps, valid for every controller.
 
-    Setpoints change freely, the cost of each step is the convex curve below its table, and queue
-    and battery are those of ``dispatch``.
+    The bound relaxes the problem: setpoints change without a ramp limit, the cost of each step is a
+    convex curve below its table, and queue and battery obey the rows of ``dispatch``.
 
     Args:
         problem: The planning problem.
-        ends: State at the first scored step and at the end; the result then has scored steps
-            alone. By default the state before the first step is that of the problem, and the end
-            keeps at least the stored energy and at most the queue of the first scored step.
+        ends: States at the first scored step and at the end; the result then contains only the
+            scored steps. None starts from the initial state of the problem. The end state must then
+            have at least the stored energy and at most the queue of the first scored step.
         check: Called before every window; an error that it raises ends the work.
 
     Returns:
-        What reaches the bound, with prices of states; no queue may be able to do it.
+        The solution of the relaxed problem, with prices of states. A real queue may be unable to
+        execute it.
 
     Raises:
-        ConfigError: no plan keeps the limits.
+        ConfigError: no plan satisfies the limits.
     """
     stage = stage_cost(problem)
     curves = _curves(problem, stage)
@@ -93,19 +99,19 @@ def bound(
 
 
 def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispatch:
-    """Find a plan of low cost that a first-in-first-out queue and the battery can carry out.
+    """Compute a plan of low cost that a first-in-first-out queue and the battery can execute.
 
-    In each step of the plan work only enters the queue, or only leaves it, or exactly the due work
-    leaves it. The first guess of these modes comes from the bound's linear programme, the second
-    from the plan that results; the better plan is returned. Plans of many steps are made window by
-    window, with the peaks of the bound where there is a demand charge.
+    Each step of the plan has a mode: work only enters the queue, work only leaves it, or exactly
+    the due work leaves it. The first modes come from the bound's linear programme, the second from
+    the plan under the first modes; the better of both plans is returned. Long plans are computed
+    window by window; with a demand charge, they start from the monthly peaks of the bound.
 
     Args:
         problem: The planning problem.
         check: Called before every window; an error that it raises ends the work.
 
     Raises:
-        ConfigError: no plan keeps the limits.
+        ConfigError: no plan satisfies the limits.
     """
     stage = stage_cost(problem, warm_up_share=_WARM_UP_SHARE)
     curves = _curves(problem, stage)
@@ -119,7 +125,7 @@ def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispa
         return _plan_of_span(part, cost, curves, of)
 
     in_one = "load" not in problem.agents or problem.work.deadline_steps is None
-    # An end that keeps the state of an earlier step is planned better with it.
+    # If the end must have the state of an earlier step, one programme should contain both steps.
     in_one |= span.as_after is not None
     longest = _LONGEST_BOUND if in_one else _LONGEST_PLAN
     ahead = _ahead(problem, _AHEAD)
@@ -136,17 +142,20 @@ def plan(problem: Problem, *, check: Callable[[], None] = lambda: None) -> Dispa
 
 
 def _curves(problem: Problem, stage: StageCost) -> LoadCurves:
-    """Cost and energy by the work done, where load is planned, or at the work of idle commands."""
+    """Return the curves of cost and energy by executed work.
+
+    If the plan does not control load, the curves are single points at the work of idle commands.
+    """
     return load_curves(problem, stage) if "load" in problem.agents else given_curves(problem, stage)
 
 
 def _ahead(problem: Problem, least: int) -> int:
-    """Steps over which the state at one step matters to another: those of two deadlines."""
+    """Return the number of steps for which a state has an influence: two deadlines or ``least``."""
     return max(least, 2 * (problem.work.deadline_steps or 0))
 
 
 def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Dispatch:
-    """The best dispatch found of those that the queue can carry out."""
+    """Return the cheapest of several dispatches that a first-in-first-out queue can execute."""
 
     def restricted(modes: I64) -> Dispatch | None:
         programme = DispatchProgramme(problem, stage, curves, span)
@@ -170,7 +179,7 @@ def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: 
     ]
     plans = [each for each in by_modes if each is not None]
     if not plans:
-        # Work that waits already may be due in a step that was to defer; draining always goes.
+        # Initially waiting work may be due in a step of mode DEFER. Mode DRAIN is always feasible.
         drained = restricted(np.full(steps, DRAIN))
         plans = [first if drained is None else drained]
     best = min(plans, key=lambda each: each.figure)
@@ -179,7 +188,10 @@ def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: 
 
 
 def _span(problem: Problem, ends: Ends | None) -> Span:
-    """All steps of a problem with the ends that it asks for, or the scored ones with given ends."""
+    """Return the range of all steps, or with ``ends`` the range of the scored steps.
+
+    Without ``ends``, the end state must be at least as good as that of the first scored step.
+    """
     if ends is not None:
         return Span(
             problem.scored_from,
@@ -198,7 +210,7 @@ def _span(problem: Problem, ends: Ends | None) -> Span:
 
 
 def _modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
-    """Mode of each step, (n,), that allows about what a dispatch does in it."""
+    """Return modes, (n,), under which the work of a dispatch is approximately feasible."""
     steps = problem.work.deadline_steps
     assert steps is not None
     entered, waiting = dispatch.deferred_tasks, dispatch.waiting_tasks
@@ -215,7 +227,7 @@ def _modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
 
 
 def _queue_modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
-    """Mode of each step, (n,), of a queue that does the work of a dispatch as far as it can."""
+    """Return the modes, (n,), of a simulated queue that follows a dispatch as closely as it can."""
     work, steps = problem.work, problem.work.deadline_steps
     assert steps is not None
     arrived = work.arrived_tasks[span.first : span.end]
@@ -242,10 +254,10 @@ def _queue_modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:
 
 
 def _solve(problem: Problem, programme: DispatchProgramme) -> Dispatch:
-    """Solve a programme.
+    """Solve a linear programme.
 
     Raises:
-        ConfigError: no plan keeps the limits.
+        ConfigError: no plan satisfies the limits.
     """
     try:
         return programme.solve()
@@ -269,18 +281,18 @@ _BY_STEP = (
 )
 """Fields of ``Dispatch`` with a value for each step."""
 Solve = Callable[[Problem, StageCost, Span], Dispatch]
-"""The best dispatch found of some steps of a problem."""
+"""Function that returns the best dispatch of a range of steps."""
 
 
 def _window_ends(problem: Problem, first: int, longest: int) -> list[int]:
-    """First steps after each window of a problem's steps.
+    """Divide the steps of a problem into windows; return the first step after each window.
 
-    Windows are about equal in length, and end where a month with a demand charge does.
+    Windows have about equal lengths, and no window crosses the end of a month with a demand charge.
 
     Args:
         problem: The planning problem.
         first: First step of the first window.
-        longest: Most steps of a window between the ends of months.
+        longest: Maximum number of steps in a window.
     """
     months = sorted({m.end for m in problem.months if first < m.end < problem.steps})
     ends: list[int] = []
@@ -293,15 +305,15 @@ def _window_ends(problem: Problem, first: int, longest: int) -> list[int]:
 def _bound_in_windows(
     problem: Problem, stage: StageCost, span: Span, ends: list[int], around: int, solve: Solve
 ) -> Dispatch:
-    """Bound of a span by windows, as if it were one dispatch.
+    """Compute the bound of a range of steps window by window, joined to one dispatch.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
-        span: The steps.
-        ends: First steps after each window; the last is the end of the span.
-        around: Steps on both sides of a border of the programmes that give its prices.
-        solve: solves the programme of a span.
+        stage: Minimum cost of each step.
+        span: The range of steps.
+        ends: First step after each window; the last entry is the end of the range.
+        around: Number of steps on each side of a border in the programme that gives its prices.
+        solve: Solves the programme of a range of steps.
     """
     prices = {
         end - 1: _border_prices(problem, stage, span, (end - 1, end - 1), around, solve)
@@ -334,15 +346,15 @@ def _bound_in_windows(
 def _plan_in_windows(
     problem: Problem, stage: StageCost, span: Span, ends: list[int], ahead: int, solve: Solve
 ) -> Dispatch:
-    """Plan of a span by windows that each start from the state that the last has left.
+    """Compute a plan window by window; each window starts from the end state of the previous one.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
-        span: The steps; ``deferred_before`` is known.
-        ends: First steps after each window; the last is the end of the span.
-        ahead: Steps after a window that its programme looks ahead.
-        solve: finds a plan of a span.
+        stage: Minimum cost of each step.
+        span: The range of steps, with ``deferred_before`` set.
+        ends: First step after each window; the last entry is the end of the range.
+        ahead: Number of steps after a window that its programme contains in addition.
+        solve: Computes a plan of a range of steps.
     """
     parts: list[Dispatch] = []
     state, first = span, span.first
@@ -389,16 +401,17 @@ def _border_prices(
     around: int,
     solve: Solve,
 ) -> tuple[float, float]:
-    """Cost of a task that waits at a border, and value of a kWh that is stored there.
+    """Compute the cost of a waiting task and the value of a stored kWh at a border of windows.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
-        span: All steps.
-        border: The step before the border and the one whose end is the border's other side, which
-            for the end that keeps the state of an earlier step is this step.
-        around: Steps on both sides of the border to take into account.
-        solve: solves the programme of a span.
+        stage: Minimum cost of each step.
+        span: The range of all steps.
+        border: The last step before the border, and the step whose end state is the state after the
+            border. Both are equal except for the condition that the last step has the state of an
+            earlier step; the second entry is then this earlier step.
+        around: Number of steps on each side of the border in the programme.
+        solve: Solves the programme of a range of steps.
     """
     before, after = border
     left = np.arange(max(before + 1 - around, span.first), before + 1)
@@ -410,7 +423,7 @@ def _border_prices(
 
 
 def _with_part_of_months(problem: Problem, begin: int, end: int) -> Problem:
-    """A problem whose months weigh as much as the part of them between two steps."""
+    """Return a problem whose monthly demand charges are scaled to the part between two steps."""
     months = []
     for month in problem.months:
         covered = max(min(month.end, end) - max(month.first, begin), 0)
@@ -425,13 +438,14 @@ def _state_values(
     begin: int,
     end: int,
 ) -> tuple[tuple[int, float, float], ...]:
-    """Costs of states at the ends of steps of a window: step, of a task, of a kWh.
+    """Return the costs of states in a window: step, cost per task, cost per kWh at its end.
 
     Args:
-        prices: Price of a task and value of a kWh at the end of the last step of each window.
-        held: The same of steps whose states are held against each other.
+        prices: Cost of a waiting task and value of a stored kWh, by the last step of each window.
+        held: Cost of a waiting task and value of a stored kWh, by the two steps of the condition
+            that the end has the state of an earlier step.
         begin: First step of the window.
-        end: First step after it.
+        end: First step after the window.
     """
     values = [(step, task, -kwh) for step, (task, kwh) in held.items() if begin <= step < end]
     if end - 1 in prices:
@@ -444,7 +458,10 @@ def _state_values(
 
 
 def _taken(problem: Problem, steps: I64) -> Problem:
-    """A problem of some steps of another, in the order given, without what lies outside."""
+    """Return a problem that consists of the chosen steps of another problem, in their order.
+
+    The new problem has no demand charges.
+    """
     work = problem.work
     return replace(
         problem,
@@ -463,7 +480,7 @@ def _taken(problem: Problem, steps: I64) -> Problem:
 
 
 def _taken_stage(stage: StageCost, steps: I64) -> StageCost:
-    """Least cost of some steps."""
+    """Return the minimum costs of the chosen steps."""
     return replace(
         stage,
         **{
@@ -475,12 +492,12 @@ def _taken_stage(stage: StageCost, steps: I64) -> StageCost:
 
 
 def _first_steps(dispatch: Dispatch, count: int) -> Dispatch:
-    """The first steps of a dispatch."""
+    """Return the first ``count`` steps of a dispatch."""
     return replace(dispatch, **{name: getattr(dispatch, name)[:count] for name in _BY_STEP})
 
 
 def _joined(parts: list[Dispatch]) -> Dispatch:
-    """Dispatches of windows end to end; the figure is the sum of theirs."""
+    """Concatenate the dispatches of windows; the figure is the sum of their figures."""
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in _BY_STEP
     }

@@ -1,4 +1,4 @@
-"""Objectives of plans, and the figure of a run under an objective."""
+"""Objectives of plans, and the value of an objective for a simulated run."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 
 _UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
-"""Units of the objectives of one term with weight 1."""
+"""Units of the objectives that consist of a single term with weight 1."""
 _TERM = re.compile(r"(?:(?P<weight>[^*]+)\*)?(?P<name>[^*]+)")
 
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """Weights of the terms of an objective, each 0 or more.
+    """Weights of the terms of an objective, each at least 0.
 
-    The figure of a run is the sum of ``carbon`` for each kg CO2e, ``energy`` for each kWh that is
-    bought, ``cost`` for each unit of the bill, and ``water`` for each litre that is made up.
+    The figure of a run is the value of its objective: the weighted sum of the emissions in kg CO2e,
+    the energy bought in kWh, the electricity bill, and the make-up water in litres.
 
     Raises:
-        ConfigError: a weight that is negative or not finite, or no weight above 0.
+        ConfigError: a weight is negative or not finite, or no weight is above 0.
     """
 
     carbon: float = 0.0
-    """Weight of a kg CO2e of the energy bought."""
+    """Weight of a kg CO2e emitted by the energy bought."""
     energy: float = 0.0
     """Weight of a kWh bought."""
     cost: float = 0.0
-    """Weight of a unit of the tariff's currency, of energy and of demand charges."""
+    """Weight of a currency unit of the electricity bill, which adds energy and demand charges."""
     water: float = 0.0
     """Weight of a litre of make-up water."""
 
@@ -50,13 +50,13 @@ class Objective:
 
     @classmethod
     def parse(cls, text: str) -> Objective:
-        """An objective from its text, such as ``carbon`` or ``carbon+0.002*water``.
+        """Create an objective from text such as ``carbon`` or ``carbon+0.002*water``.
 
         Args:
-            text: names of terms, joined by ``+``, each with a weight before it or with weight 1.
+            text: names of terms, joined by ``+``. A term without a weight has weight 1.
 
         Raises:
-            ConfigError: an unknown term, one that is given twice, or a weight that is no number.
+            ConfigError: a term is unknown or repeated, or a weight is not a number.
         """
         valid = [f.name for f in fields(cls)]
         weights: dict[str, float] = {}
@@ -80,7 +80,7 @@ class Objective:
         return cls(**weights)
 
     def __str__(self) -> str:
-        """The text that ``parse`` reads."""
+        """Return the text from which ``parse`` creates this objective."""
         weights = {f.name: getattr(self, f.name) for f in fields(self)}
         return "+".join(
             name if weight == 1.0 else f"{_shortest(weight)}*{name}"
@@ -90,11 +90,11 @@ class Objective:
 
     @property
     def unit(self) -> str:
-        """Unit of the figure; of a sum, the text of the objective."""
+        """Unit of the figure; an objective with several terms has its text as unit."""
         return _UNITS.get(str(self), str(self))
 
     def kwh_weight(self, ci_g_per_kwh: F64, price_per_kwh: F64) -> F64:
-        """Weight of a kWh bought in each step, without demand charges, (B, T).
+        """Return the weight of a kWh bought in each step, without demand charges, (B, T).
 
         Args:
             ci_g_per_kwh: Carbon intensity, in g CO2e/kWh, (B, T).
@@ -103,11 +103,11 @@ class Objective:
         return self.energy + self.carbon * ci_g_per_kwh / 1e3 + self.cost * price_per_kwh
 
     def kw_month_weight(self, fleet: Fleet) -> F64:
-        """Weight of each kW of the highest power of a month, (B,)."""
+        """Return the weight of a kW of the month's highest power, (B,)."""
         return np.asarray(self.cost * fleet.values("tariff.demand_charge_per_kw"))
 
     def figure(self, *, cfp_kg: F64, grid_kwh: F64, cost: F64, water_l: F64) -> F64:
-        """The figure of a run, (B,).
+        """Return the figure of a run of B data centers, (B,).
 
         Args:
             cfp_kg: Carbon of the energy bought, in kg CO2e, (B,).
@@ -121,17 +121,17 @@ class Objective:
 
 
 def _shortest(weight: float) -> str:
-    """The shortest text that is read as this very number, without a plus sign."""
+    """Return the shortest text, without plus signs, that ``float`` converts to this number."""
     return repr(float(weight)).removesuffix(".0").replace("e+", "e")
 
 
 class Score:
-    """Sums and extremes of the scored steps of B data centers.
+    """Accumulates sums and extremes of the scored steps of B data centers.
 
     Args:
-        objective: objective that the figure counts.
-        sim: the simulator, which has been reset and has done no step.
-        scored_from: first step that counts.
+        objective: objective whose value the figure is.
+        sim: the simulator, directly after a reset.
+        scored_from: number of the first scored step.
     """
 
     def __init__(self, objective: Objective, sim: Simulator, scored_from: int = 0) -> None:
@@ -143,16 +143,16 @@ class Score:
         self._sums = {name: np.zeros(sim.size) for name in names}
         self._steps = 0
         self.start_kwh, self.start_tasks = _memory(sim)
-        """Energy stored, in kWh, and work that waits, in tasks, at the first scored step, (B,)."""
+        """Stored energy in kWh, and waiting work in tasks, at the first scored step, (B,) each."""
         self.end_kwh, self.end_tasks = _memory(sim)
-        """Energy stored, in kWh, and work that waits, in tasks, after the last step, (B,)."""
+        """Stored energy in kWh, and waiting work in tasks, after the last step, (B,) each."""
         self.most_overdue_tasks = np.zeros(sim.size)
-        """Most overdue work of a scored step, in tasks, (B,)."""
+        """Maximum overdue work in a scored step, in tasks, (B,)."""
         self.hottest_inlet_c = np.full(sim.size, -np.inf)
-        """Hottest inlet of the scored steps, in C, (B,)."""
+        """Highest inlet temperature in the scored steps, in C, (B,)."""
 
     def add(self, result: StepResult) -> None:
-        """Add the step that follows those added before."""
+        """Add the result of the next step; steps must be added in order."""
         self.end_kwh = result.stored_kwh.copy()
         self.end_tasks = result.queue_tasks.copy()
         if result.step < self._from:
@@ -167,7 +167,7 @@ class Score:
 
     @property
     def figure(self) -> F64:
-        """The figure of the scored steps, in the unit of the objective, (B,)."""
+        """Value of the objective for the scored steps, (B,)."""
         kw_months = billed_kw_months(self._demand, self._steps)
         return self._objective.figure(
             cfp_kg=self._sums["carbon_g"] / 1e3,
@@ -178,16 +178,16 @@ class Score:
 
     @property
     def dropped_tasks(self) -> F64:
-        """Work that found the queue full, in tasks, (B,)."""
+        """Work dropped because the queue was full, in tasks, (B,)."""
         return self._sums["dropped_tasks"]
 
     @property
     def unmet_kwh(self) -> F64:
-        """Heat that stayed in the room, in kWh, (B,)."""
+        """Heat that the cooling did not remove from the room, in kWh, (B,)."""
         return self._sums["unmet_w"] * self._step_h / 1e3
 
 
 def _memory(sim: Simulator) -> tuple[F64, F64]:
-    """Energy stored, in kWh, and work that waits, in tasks, of each data center, (B,)."""
+    """Return stored energy in kWh and waiting work in tasks of each data center, (B,) each."""
     state = sim.state
     return state.stored_kwh.copy(), state.queue[:, -1].copy()

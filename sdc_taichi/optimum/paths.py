@@ -1,4 +1,4 @@
-"""Paths of one data center that its planning problem suggests, to be run by the simulator."""
+"""Planned paths of one data center: target states that the simulator then follows."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from sdc_taichi.types import F64, BatteryResult
 IDLE = "idle commands"
 """Name of the path under idle commands."""
 JOINT = "all agents"
-"""Name of the path that moves all agents of a problem together."""
+"""Name of the path for which all agents of a problem are planned together."""
 _UNSCORED_SHARE = 1e-3
-"""Weight of a kWh in steps that are not scored, relative to the mean of the others: it decides
-between paths that are otherwise alike."""
+"""Weight of a kWh in steps that are not scored, relative to the mean weight of scored steps. It
+breaks ties between otherwise equal paths."""
 _PEAK_SHARES = (np.inf, 1.0, 0.97, 0.94, 0.9, 0.86, 0.82, 0.78)
-"""Limits of the power bought that are tried where peaks cost, relative to the highest load."""
+"""Candidate limits of the power bought under a demand charge, relative to the highest load."""
 _STORED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""States of charge at the first scored step that are tried."""
+"""Candidate states of charge at the first scored step."""
 
 
 def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
-    """Agents that each path of a data center moves, by its name.
+    """Return the paths to plan for a data center, by name, with the agents that each path moves.
 
-    There is that of idle commands, one for each agent alone, and one for all of them together.
+    The paths are that of idle commands, one for each agent alone, and one for all agents together.
 
     Args:
         problem: The planning problem.
@@ -55,10 +55,11 @@ def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
 def path_of(
     problem: Problem, agents: tuple[Agent, ...], check: Callable[[], None] = lambda: None
 ) -> Targets:
-    """A good path that moves some agents and leaves the others idle.
+    """Plan a path of low cost that moves some agents and leaves the others idle.
 
-    Work comes from the linear programme, setpoints from the dynamic programme for that work, and
-    the battery's path is that for the energy which the facility then needs.
+    The path is planned in three stages. A linear programme gives the work of each step, dynamic
+    programming gives the setpoints for this work, and the battery is planned for the energy that
+    the facility then needs.
 
     Args:
         problem: The planning problem.
@@ -66,7 +67,7 @@ def path_of(
         check: Called before every linear programme; an error that it raises ends the work.
 
     Raises:
-        ConfigError: No plan keeps the limits.
+        ConfigError: No plan satisfies the limits.
     """
     executed = problem.work.idle_tasks
     if "load" in agents:
@@ -75,21 +76,22 @@ def path_of(
 
 
 def with_battery_for(problem: Problem, path: Targets, facility_kwh: F64) -> Targets:
-    """A path whose battery follows an energy of the facility that is known better.
+    """Plan the battery of a path again for a better estimate of the facility's energy.
 
     Args:
         problem: The planning problem.
-        path: The path, which moves the battery.
-        facility_kwh: Energy of the facility along it, in kWh, (T,).
+        path: A path that moves the battery.
+        facility_kwh: Energy of the facility in each step of the path, in kWh, (T,).
     """
     stored = _stored_kwh(problem, facility_kwh)
     return replace(path, stored_kwh=stored[:, None], facility_kwh=facility_kwh[:, None])
 
 
 def weight_of_kwh(problem: Problem) -> F64:
-    """Weight of a kWh of the facility in each step, with a share of the peaks, (T,).
+    """Return the weight of a kWh in each step, including demand charges, (T,).
 
-    A demand charge is spread over its month. Steps that are not scored have a little weight.
+    The demand charge of a month is divided evenly among its hours. Steps that are not scored have a
+    small positive weight.
     """
     weight = problem.kwh_weight.copy()
     for month in problem.months:
@@ -101,7 +103,7 @@ def weight_of_kwh(problem: Problem) -> F64:
 
 
 def _path(problem: Problem, agents: tuple[Agent, ...], executed_tasks: F64) -> Targets:
-    """The path that does some work, with the setpoints and the battery that suit it."""
+    """Plan the setpoints and the battery of a path for known work, in tasks, (T,)."""
     setpoint_c = problem.idle_setpoint_c
     utilisation = np.minimum(executed_tasks / TASKS_PER_STEP, 1.0)
     if "cooling" in agents:
@@ -114,7 +116,7 @@ def _path(problem: Problem, agents: tuple[Agent, ...], executed_tasks: F64) -> T
 
 
 def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:
-    """Work in the queue after each step, in tasks, (T,); what finds it full is dropped."""
+    """Return the work in the queue after each step, in tasks, (T,); a full queue drops work."""
     rise = problem.work.arrived_tasks - executed_tasks
     limit = problem.work.queue_limit_tasks
     if problem.work.most_dropped_tasks == 0.0:
@@ -126,7 +128,7 @@ def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:
 
 
 def _setpoints_c(problem: Problem, utilisation: F64) -> F64:
-    """Setpoints of least cost for the utilisation of each step, in C, (T,)."""
+    """Return the setpoints of lowest cost for the utilisation of each step, in C, (T,)."""
     table = problem.table
     energy = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)
     water, inlet_c, unmet_w = (
@@ -139,7 +141,7 @@ def _setpoints_c(problem: Problem, utilisation: F64) -> F64:
 
 
 def _stored_kwh(problem: Problem, facility_kwh: F64) -> F64:
-    """Energy stored after each step for a known energy of the facility, in kWh, (T,)."""
+    """Plan the stored energy after each step for a known energy of the facility, in kWh, (T,)."""
     storage = problem.storage
     if storage.model == "released":
         return _released_kwh(problem, facility_kwh)
@@ -152,14 +154,17 @@ def _stored_kwh(problem: Problem, facility_kwh: F64) -> F64:
 
 
 def _known_facility(facility_kwh: F64) -> FacilityTable:
-    """Table of a facility whose energy is the same at all utilisations and setpoints."""
+    """Return a table with a known energy that does not depend on utilisation or setpoint."""
     values = np.broadcast_to(facility_kwh[:, None, None], (len(facility_kwh), 2, 1))
     nothing = np.zeros(values.shape)
     return FacilityTable(np.array([0.0, 1.0]), np.array([20.0]), values, nothing, nothing, nothing)
 
 
 def _released_kwh(problem: Problem, facility_kwh: F64) -> F64:
-    """Path of a battery of model ``released``, (T,): the cheapest of several peaks and starts."""
+    """Plan the stored energy of a ``released`` battery after each step, in kWh, (T,).
+
+    The plan is the cheapest of those for several candidate peaks and initial states of charge.
+    """
     peaks = _PEAK_SHARES if problem.months else _PEAK_SHARES[:1]
     starts = _STORED_SHARES if problem.scored_from else (None,)
     best, least = np.full(problem.steps, problem.storage.stored_kwh), np.inf
@@ -176,7 +181,17 @@ def _released_kwh(problem: Problem, facility_kwh: F64) -> F64:
 def _released_once(
     problem: Problem, facility_kwh: F64, start_share: float | None, most_grid_kw: float
 ) -> F64:
-    """Path of a battery of model ``released``, from a state of charge at the first scored step."""
+    """Plan a ``released`` battery for one candidate peak and one initial state of charge.
+
+    Args:
+        problem: The planning problem.
+        facility_kwh: Energy of the facility in each step, in kWh, (T,).
+        start_share: State of charge at the first scored step, 0..1; None if all steps are scored.
+        most_grid_kw: Candidate limit of the power bought, in kW.
+
+    Returns:
+        Stored energy after each step, in kWh, (T,).
+    """
     weight, split = weight_of_kwh(problem), problem.scored_from
     storage, before = problem.storage, np.empty(0)
     limits = {
@@ -200,7 +215,10 @@ def _released_once(
 
 
 def _battery_cost(problem: Problem, facility_kwh: F64, stored_kwh: F64) -> float:
-    """Cost of a path of a battery without losses; inf where it ends lower than it began."""
+    """Return the cost of the stored energies of a battery without losses.
+
+    The cost is inf if the battery stores less at the end than at the first scored step.
+    """
     grid_kwh = facility_kwh + np.diff(stored_kwh, prepend=problem.storage.stored_kwh)
     split = problem.scored_from
     begin = stored_kwh[split - 1] if split else problem.storage.stored_kwh
@@ -214,20 +232,21 @@ def _battery_cost(problem: Problem, facility_kwh: F64, stored_kwh: F64) -> float
 
 
 _ROUND_OFF_K = 1e-9
-"""By how much rounding may make a change of the setpoint larger than it is, in K."""
+"""Tolerance of the ramp limit of setpoints for rounding errors, in K."""
 
 
 def setpoint_path(cost: F64, setpoint_c: F64, *, ramp_k: float, start_c: float) -> F64:
-    """Setpoints of least cost among the nodes of a grid, in C, (T,).
+    """Return the sequence of setpoints with the lowest total cost, in C, (T,).
 
-    Bellman's recursion from the last step on: the least cost from step t and node j on is the cost
-    of t there plus the least of what may follow (R. Bellman, Dynamic Programming, 1957). A node
-    that is barred in a step is used where there is no other way, as rarely as can be.
+    Dynamic programming goes backwards from the last step: the cost-to-go at a node is the cost of
+    the step there plus the smallest cost-to-go of a node that the ramp limit allows next (R.
+    Bellman, Dynamic Programming, 1957). A node with infinite cost is used only if no path avoids
+    such nodes, and then as rarely as possible.
 
     Args:
-        cost: Cost of each step and node, inf where the node is barred, (T, J).
-        setpoint_c: Setpoints of the nodes, rising, in C, (J,).
-        ramp_k: Largest change between two steps, in K; inf without a limit.
+        cost: Cost of each step and node, inf for nodes that are not allowed, (T, J).
+        setpoint_c: Setpoints of the nodes, increasing, in C, (J,).
+        ramp_k: Maximum change of the setpoint between two steps, in K; inf without a limit.
         start_c: Setpoint before the first step, in C.
     """
     cost = _finite(cost)
@@ -238,7 +257,7 @@ def setpoint_path(cost: F64, setpoint_c: F64, *, ramp_k: float, start_c: float) 
     best_next = np.empty(cost.shape, dtype=np.int64)
     to_go = np.zeros(len(setpoint_c))
     for t in range(steps - 1, -1, -1):
-        # Entry i is the node from which step t starts, entry j the one that it moves to.
+        # Row i is the node before step t, column j the node in step t.
         options = allowed + (cost[t] + to_go)
         best_next[t] = options.argmin(axis=1)
         to_go = options[np.arange(len(to_go)), best_next[t]]
@@ -254,7 +273,10 @@ def setpoint_path(cost: F64, setpoint_c: F64, *, ramp_k: float, start_c: float) 
 
 
 def _finite(cost: F64) -> F64:
-    """Cost with barred nodes at more than all other steps together can differ by, (T, J)."""
+    """Replace infinite costs by a finite penalty, (T, J).
+
+    The penalty exceeds all cost differences that the other steps together can cause.
+    """
     barred = np.isinf(cost)
     if not barred.any():
         return cost
@@ -268,13 +290,13 @@ def _finite(cost: F64) -> F64:
 
 
 LEVELS = 201
-"""Levels of stored energy at which the value of what is stored is computed."""
+"""Number of equally spaced levels of stored energy for the dynamic programme of a battery."""
 COMMANDS = np.linspace(-1.0, 1.0, 21)
-"""Battery commands among which a step chooses."""
+"""Candidate battery commands of a step in the dynamic programme."""
 BatteryModel = Callable[[F64, F64, F64 | float], BatteryResult]
-"""Result of a step from the energy stored, a command, and the energy of the facility, in kWh."""
+"""Battery model: maps stored energy in kWh, command and facility energy in kWh to a result."""
 _SHORTAGE_FACTOR = 10.0
-"""Price of a kWh that is missing at the end, relative to the highest price of a kWh delivered."""
+"""Price of a kWh missing from the battery at the end, relative to the highest price of a kWh."""
 
 
 def battery_path(
@@ -287,20 +309,20 @@ def battery_path(
     grid_limit_kw: float = np.inf,
     most_grid_kw: float = np.inf,
 ) -> F64:
-    """Stored energy after each step of the cheapest path, in kWh, (T,).
+    """Plan the stored energy after each step by dynamic programming, in kWh, (T,).
 
-    The value of stored energy at the end of each step is computed backwards at ``LEVELS`` levels
-    and read linearly between them; commands of least cost are then followed forwards with the model
-    itself, so that the path is one that the battery can take.
+    A backward pass computes the cost-to-go at ``LEVELS`` levels of stored energy in each step, and
+    interpolates linearly between them. A forward pass then applies the cheapest commands with the
+    battery model itself, so the battery can follow the path exactly.
 
     Args:
-        storage: The battery, with what it stores before the first step.
+        storage: The battery, with its stored energy before the first step.
         facility_kwh: Energy of the facility in each step, in kWh, (T,).
         kwh_weight: Weight of a kWh bought in each step, (T,).
         step_h: Length of a step, in h.
-        end_kwh: Least energy stored at the end, in kWh.
-        grid_limit_kw: Power beyond which the battery does not charge, in kW; inf without a limit.
-        most_grid_kw: Power bought that the path is to keep below where it can, in kW.
+        end_kwh: Minimum energy stored at the end, in kWh.
+        grid_limit_kw: Power bought at which the battery stops charging, in kW; inf without a limit.
+        most_grid_kw: Soft upper limit of the power bought, in kW; inf without a limit.
     """
     steps, capacity = len(facility_kwh), storage.capacity_kwh
     if capacity <= 0:
@@ -325,17 +347,17 @@ def battery_path(
 
 
 def storage_parameters(storage: Storage) -> BatteryParameters:
-    """Efficiencies, rates and limits of a battery."""
+    """Return the parameters of the battery models: efficiencies, rates and limits."""
     return BatteryParameters(*(getattr(storage, name) for name in BatteryParameters._fields))
 
 
 def battery_model(storage: Storage, step_h: float, grid_limit_kw: float) -> BatteryModel:
-    """The model of a battery as a function of stored energy, command and energy of the facility.
+    """Return a battery model as a function of stored energy, command and facility energy.
 
     Args:
         storage: The battery.
         step_h: Length of a step, in h.
-        grid_limit_kw: Power beyond which the battery does not charge, in kW; inf without a limit.
+        grid_limit_kw: Power bought at which the battery stops charging, in kW; inf without a limit.
     """
     model, parameters = BATTERIES[storage.model], storage_parameters(storage)
 
@@ -358,7 +380,18 @@ def _follow(
     step_h: float,
     end_kwh: float,
 ) -> F64:
-    """Stored energy after each step along the commands of least cost, in kWh, (T,)."""
+    """Apply the cheapest command in each step; return the stored energy after it, in kWh, (T,).
+
+    Args:
+        storage: The battery, with its stored energy before the first step.
+        facility_kwh: Energy of the facility in each step, in kWh, (T,).
+        values: Cost-to-go by step and level, (T + 1, levels).
+        levels: Levels of stored energy, in kWh, (levels,).
+        run: Battery model.
+        cost: Cost of the energy bought in a step, by number of the step and energy in kWh.
+        step_h: Length of a step, in h.
+        end_kwh: Minimum energy stored at the end, in kWh.
+    """
     stored = np.array([storage.stored_kwh])
     path = np.empty(len(facility_kwh))
     fine = np.linspace(-1.0, 1.0, 4 * (len(COMMANDS) - 1) + 1)

@@ -1,4 +1,4 @@
-"""The planning problem of one data center over T steps, in the numbers that planners need."""
+"""Planning problem of one data center for T steps: tables, weights, work, battery and limits."""
 
 from __future__ import annotations
 
@@ -27,40 +27,44 @@ from sdc_taichi.types import F64, I64
 
 Agent = Literal["load", "cooling", "battery"]
 AGENTS: tuple[Agent, ...] = ("load", "cooling", "battery")
-"""Agents that a plan may move, by the names of the fields of ``Actions``."""
+"""Agents that a plan may control, named by their fields of ``Actions``."""
 RAMP_K = 2.0
-"""Largest change of the setpoint in a step, in K, as that of environments by default."""
+"""Maximum change of the setpoint in a step, in K, equal to the default of environments."""
 
 
 class StoppedError(SdcError):
-    """Solving was stopped before its end; the message says what is kept."""
+    """The caller stopped the optimisation; the message says which results are cached."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlexibleWork:
-    """Work that arrives over T steps, and what of it may wait; in tasks, 1 % of a full step."""
+    """Arriving work of T steps and the part that may wait, in tasks.
+
+    A task is 1 % of the work of a step at full load.
+    """
 
     arrived_tasks: F64
-    """Work that arrives, (T,)."""
+    """Work that arrives in each step, in tasks, (T,)."""
     idle_tasks: F64
-    """Work that is done under idle commands, (T,)."""
+    """Work executed in each step under idle commands, in tasks, (T,)."""
     most_deferred_tasks: F64
-    """Most of it that can be deferred, (T,)."""
+    """Maximum arriving work that can be deferred in each step, in tasks, (T,)."""
     most_executed_tasks: F64
-    """Most work that a step can do, (T,)."""
+    """Maximum work that can be executed in each step, in tasks, (T,)."""
     queue_limit_tasks: float
-    """Longest queue; inf without a limit."""
+    """Maximum length of the queue, in tasks; inf without a limit."""
     deadline_steps: int | None
-    """Steps after which deferred work has to run; None is never."""
+    """Number of steps after which deferred work must be executed; None means no deadline."""
     model: str
-    """Name of the model of work: ``fluid`` or ``tasks``."""
+    """Name of the workload model: ``fluid`` or ``tasks``."""
     most_dropped_tasks: float = 0.0
-    """Most work that may be dropped in all scored steps: as much as under idle commands."""
+    """Maximum work that may be dropped in all scored steps, in tasks; equal to the work dropped
+    under idle commands."""
 
 
 @dataclass(frozen=True, slots=True)
 class Storage:
-    """A battery, in the parameters of ``plant.battery``."""
+    """A battery, described by the parameters of ``plant.battery``."""
 
     model: str
     """Name of the battery model: ``clc``, ``paper`` or ``released``."""
@@ -69,65 +73,65 @@ class Storage:
     stored_kwh: float
     """Energy stored before the first step, in kWh."""
     charge_efficiency: float
-    """Energy stored per energy drawn."""
+    """Ratio of stored energy to energy drawn."""
     discharge_factor: float
-    """Energy taken from the store per energy delivered."""
+    """Ratio of energy taken from the store to energy delivered."""
     charge_limit_c_rate: float
-    """Largest rate into the store, in capacities per hour."""
+    """Maximum charge rate into the store, in capacities per hour."""
     discharge_limit_c_rate: float
-    """Largest rate out of the store, in capacities per hour."""
+    """Maximum discharge rate out of the store, in capacities per hour."""
     upper_u_h: float
-    """Rise of the highest stored energy with the charge power, in h."""
+    """Slope of the maximum stored energy with respect to charge power, in h (kWh per kW)."""
     upper_v: float
-    """Highest stored energy without charge power, as a share of capacity."""
+    """Maximum stored energy at zero charge power, as a share of capacity."""
     lower_u_h: float
-    """Rise of the lowest stored energy with the discharge power, in h."""
+    """Slope of the minimum stored energy with respect to discharge power, in h (kWh per kW)."""
     lower_v: float
-    """Lowest stored energy without discharge power, as a share of capacity."""
+    """Minimum stored energy at zero discharge power, as a share of capacity."""
 
 
 @dataclass(frozen=True, slots=True)
 class BilledMonth:
-    """A month, or the part of it that is scored, whose highest power a bill charges for."""
+    """The scored part of a calendar month with a demand charge."""
 
     first: int
-    """First step of the plan that counts."""
+    """Number of the first scored step of the month, counted from the first step of the plan."""
     end: int
-    """First step after it that does not."""
+    """Number of the first step after the scored part of the month."""
     weight_per_kw: float
-    """Weight of each kW of the highest mean power of a step."""
+    """Weight per kW of the month's highest power, where power is the mean of a step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """States that a plan starts from and has to leave, if not the state before the first step.
+    """States of a plan at its first scored step and at its end.
 
-    Without ``Ends`` a plan leaves at least the stored energy and at most the queue that there were
-    at the first scored step.
+    Without ``Ends`` a plan must end with at least the stored energy and at most the queue of its
+    first scored step.
     """
 
     start_kwh: float
     """Energy stored at the first scored step, in kWh."""
     start_tasks: float
-    """Work that waits at the first scored step, in tasks, of any age."""
+    """Work of any age that waits at the first scored step, in tasks."""
     end_kwh: float
-    """Least energy stored at the end, in kWh."""
+    """Minimum energy stored at the end, in kWh."""
     end_tasks: float
-    """Most work that waits at the end, in tasks."""
+    """Maximum work that waits at the end, in tasks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The planning problem of one data center over T steps."""
+    """Planning problem of one data center in a run of T steps."""
 
     name: str
     """Name of the data center."""
     step_h: float
     """Length of a step, in h."""
     agents: tuple[Agent, ...]
-    """Agents that the plan may move; the others follow idle commands."""
+    """Agents that the plan may control; the others follow idle commands."""
     table: FacilityTable
-    """Energy, water and inlets of each step."""
+    """Energy, water and inlet temperature of each step, by utilisation and setpoint."""
     kwh_weight: F64
     """Weight of a kWh bought in each step, (T,); 0 in steps that are not scored."""
     litre_weight: float
@@ -135,21 +139,22 @@ class Problem:
     months: tuple[BilledMonth, ...]
     """Months with a demand charge."""
     work: FlexibleWork
-    """Work to do."""
+    """Arriving work and limits of its execution."""
     storage: Storage
-    """The battery; of capacity 0 where there is none."""
+    """The battery; without a battery its capacity is 0."""
     grid_limit_kw: float
-    """Power beyond which the battery does not charge, in kW; inf without a limit."""
+    """Power bought at which the battery stops charging, in kW; inf without a limit."""
     inlet_limit_c: float
-    """Highest inlet that a plan may cause where it has a choice, in C; inf without a limit."""
+    """Highest inlet temperature that a plan may cause if another setpoint avoids it, in C; inf
+    without a limit."""
     idle_setpoint_c: F64
     """Setpoint of each step under idle commands, in C, (T,)."""
     setpoint_c: float
     """Setpoint before the first step, in C."""
     ramp_k: float
-    """Largest change of the setpoint between two steps, in K."""
+    """Maximum change of the setpoint between two steps, in K."""
     scored_from: int
-    """First step that is scored."""
+    """Number of the first scored step."""
 
     @property
     def steps(self) -> int:
@@ -170,20 +175,20 @@ def problems_of(
     inlet_limit_c: float | None = None,
     ramp_k: float = RAMP_K,
 ) -> list[Problem]:
-    """The planning problem of each data center, B.
+    """Create the planning problem of each data center of a fleet.
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs, with prices.
-        sizing: Their devices.
-        tables: Tables of their T steps, B.
-        start: First step of each, counted from the beginning of the year, (B,).
-        objective: Objective that plans minimise.
-        agents: Agents that plans may move.
-        scored_from: First step that is scored.
-        inlet_limit_c: Highest inlet that a plan may cause where it has a choice, in C; None is the
-            limit of ``protection.ashrae_class``, and none where that is not set.
-        ramp_k: Largest change of the setpoint in a step, in K.
+        drivers: Inputs of the data centers, including prices.
+        sizing: Device sizes of the data centers.
+        tables: Tables of the T steps of each data center, B.
+        start: First step of each data center, counted from the beginning of the year, (B,).
+        objective: Objective that the plans minimise.
+        agents: Agents that the plans may control.
+        scored_from: Number of the first scored step.
+        inlet_limit_c: Highest inlet temperature that a plan may cause if another setpoint avoids
+            it, in C. None means the limit of ``protection.ashrae_class``, or no limit without it.
+        ramp_k: Maximum change of the setpoint in a step, in K.
     """
     steps = len(tables[0].facility_kwh)
     index = start[:, None] + np.arange(steps)
@@ -219,11 +224,11 @@ def problems_of(
 
 
 def inlet_limits_c(fleet: Fleet, given_c: float | None = None) -> F64:
-    """Highest inlet that plans may cause, in C, (B,); inf without a limit.
+    """Return the limit of inlet temperatures of each data center, in C, (B,); inf without a limit.
 
     Args:
         fleet: B data centers.
-        given_c: The limit, in C; None is that of ``protection.ashrae_class``, if it is set.
+        given_c: Common limit, in C; None means the limits of ``protection.ashrae_class``.
     """
     if given_c is not None:
         return np.full(fleet.size, given_c)
@@ -232,7 +237,7 @@ def inlet_limits_c(fleet: Fleet, given_c: float | None = None) -> F64:
 
 
 def _idle_setpoint_c(fleet: Fleet, index: I64) -> F64:
-    """Setpoints under idle commands: those of the schedule, and the initial one without, (B, T)."""
+    """Return the setpoints under idle commands, in C, (B, T): scheduled, or else initial ones."""
     initial_c = np.repeat(fleet.values("hvac.setpoint.initial_c")[:, None], index.shape[1], axis=1)
     schedules = schedules_c(fleet)
     if schedules is None:
@@ -244,9 +249,9 @@ def _idle_setpoint_c(fleet: Fleet, index: I64) -> F64:
 def _months(
     start: int, steps: int, scored_from: int, steps_per_hour: int, weight_per_kw: float
 ) -> tuple[BilledMonth, ...]:
-    """The months of a run whose highest power is charged for; none at weight 0.
+    """Return the months of a run with a demand charge; there are none if the weight is 0.
 
-    A month that is scored in part counts by this part of it, as in ``sim.bills``.
+    The charge of a partly scored month is proportional to the scored part, as in ``sim.bills``.
     """
     months: list[BilledMonth] = []
     first = start + scored_from
@@ -260,7 +265,7 @@ def _months(
 
 
 def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
-    """Work of each data center, B, from its demand, (B, T)."""
+    """Compute the work of each of B data centers from the demand, a share of capacity, (B, T)."""
     model = fleet.models["workload"]
     limits, due = queue_limit_tasks(fleet), due_steps(fleet)
     idle_tasks, dropped_tasks = _under_idle_commands(fleet, demand)
@@ -292,12 +297,12 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
 
 
 def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
-    """Work that arrives as a model of work counts it, in tasks.
+    """Return the arriving work as a workload model counts it, in tasks.
 
     Args:
-        model: name of the model of work.
+        model: name of the workload model.
         demand: work that arrives, as a share of capacity, 0..1.
-        flexible_share: share of it that may wait, 0..1.
+        flexible_share: share of the demand that may wait, 0..1.
     """
     nothing = np.zeros(np.shape(demand))
     work = WORK_MODELS[model].step(
@@ -315,7 +320,7 @@ def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
 
 
 def _under_idle_commands(fleet: Fleet, demand: F64) -> tuple[F64, F64]:
-    """Work that is done and dropped in each step under idle commands, in tasks, (B, T) each."""
+    """Return executed and dropped work of each step under idle commands, in tasks, (B, T) each."""
     workload = Workload(fleet)
     queue, idle = workload.empty_queue(), np.zeros(fleet.size)
     done, dropped = np.empty(demand.shape), np.empty(demand.shape)
@@ -328,11 +333,18 @@ def _under_idle_commands(fleet: Fleet, demand: F64) -> tuple[F64, F64]:
 
 
 def _most_deferred_fluid(arrived: F64, share: float, cap: float, deadline: int | None) -> F64:
-    """Most of the arriving work that can wait, in tasks, (T,).
+    """Return the maximum arriving work that can wait in model ``fluid``, in tasks, (T,).
 
-    It is the flexible share, and beyond that what finds no room beside work whose deadline has
-    come. That is at most what was deferred a deadline earlier, as long as every step can do all of
-    the work that arrives in one; where it cannot, all arriving work may have to wait.
+    The flexible share may wait by choice. In addition, arriving work must wait if due work leaves
+    no capacity for it. Due work is at most the work deferred one deadline earlier, provided that
+    every step can execute all work that arrives in it. Otherwise all arriving work may have to
+    wait.
+
+    Args:
+        arrived: Arriving work, in tasks, (T,).
+        share: Flexible share of the arriving work, 0..1.
+        cap: Maximum work of a step, in tasks.
+        deadline: Deadline in steps; None means no deadline.
     """
     most = share * arrived
     if np.any(arrived > cap):
@@ -345,7 +357,7 @@ def _most_deferred_fluid(arrived: F64, share: float, cap: float, deadline: int |
 
 
 def _storage(fleet: Fleet, sizing: Sizing) -> list[Storage]:
-    """Battery of each data center, B, full to the initial state of charge."""
+    """Return the battery of each of B data centers at its initial state of charge."""
     initial_kwh = fleet.values("battery.initial_soc") * sizing.battery_kwh
     return [
         Storage(
@@ -363,35 +375,37 @@ _PLACEMENT = {
     "inlet-aware": "placement inlet-aware follows the inlets of the step before",
     "weights": "placement weights lets actions move work between racks",
 }
-"""Policies of placement whose work lies elsewhere than in the table."""
+"""Placement policies for which a table is not exact, with the reason in words."""
 
 
 def no_table_reasons(fleet: Fleet) -> tuple[str | None, ...]:
-    """Why the cost of a step follows from more than utilisation, setpoint and weather.
+    """Return why the tables of data centers are not exact.
+
+    A table is exact if the energy of a step follows from utilisation, setpoint and weather alone.
 
     Args:
         fleet: B data centers.
 
     Returns:
-        The reasons of each data center in words, or None where its tables are exact, B.
+        Reasons for each data center in words, or None if its table is exact, B.
     """
     return tuple("; ".join(_reasons(config)) or None for config in fleet.configs)
 
 
 def uncooled_reason(table: FacilityTable, utilisation: F64) -> str | None:
-    """Why idle commands leave a table: steps in which no setpoint keeps up with the load.
+    """Return why idle commands leave the range of a table: steps that no setpoint can cool.
 
     Args:
         table: Table of the steps.
-        utilisation: Utilisation of each step, 0..1, (T,).
+        utilisation: Utilisation of each step under idle commands, 0..1, (T,).
 
     Returns:
-        The reason in words; None where some setpoint does in every step.
+        The reason in words, or None if some setpoint can cool the hall in every step.
     """
     cooled = (table.unmet_w == 0.0).any(axis=2)
     high = np.searchsorted(table.utilisation, utilisation).clip(1, len(table.utilisation) - 1)
     steps = np.arange(len(utilisation))
-    # A utilisation at a node, if rounded, needs no more than that node.
+    # A utilisation that equals a node up to rounding depends on this node alone.
     share = (utilisation - table.utilisation[high - 1]) / np.diff(table.utilisation)[high - 1]
     kept = (cooled[steps, high - 1] | (share > 1.0 - 1e-9)) & (cooled[steps, high] | (share < 1e-9))
     if kept.all():
@@ -403,13 +417,13 @@ def uncooled_reason(table: FacilityTable, utilisation: F64) -> str | None:
 
 
 def forced_discharge_reason(problem: Problem) -> str | None:
-    """Why a battery that no plan moves may move: it delivers what the grid does not carry.
+    """Return why an idle battery may discharge: the load may exceed the grid connection's limit.
 
     Args:
         problem: Planning problem of the data center.
 
     Returns:
-        The reason in words; None where the battery stays at rest.
+        The reason in words, or None if an idle battery never discharges.
     """
     table, limit_kw = problem.table, problem.grid_limit_kw
     most_kw = float(np.where(table.unmet_w == 0.0, table.facility_kwh, 0.0).max()) / problem.step_h
@@ -422,7 +436,7 @@ def forced_discharge_reason(problem: Problem) -> str | None:
 
 
 def _reasons(config: DataCenterConfig) -> list[str]:
-    """Reasons why the table of a data center is not exact, in words."""
+    """Return all reasons why the table of a data center is not exact, in words."""
     events = config.events
     reasons = []
     if config.simulation.thermal == "transient":

@@ -1,6 +1,6 @@
-"""A linear programme written as equations between blocks of variables, solved by HiGHS.
+"""Linear programmes as equations between blocks of variables, solved with HiGHS.
 
-Three hours of a battery that buys at changing prices and has to be full at the end::
+The example charges a battery within three hours at changing prices; it must be full at the end::
 
     programme = Programme()
     charge = programme.variables("charge", 3, upper=2.0, cost=np.array([0.3, 0.1, 0.2]))
@@ -9,11 +9,11 @@ Three hours of a battery that buys at changing prices and has to be full at the 
     programme.at_most("full", 4.0, stored[-1])
     solution = programme.solve()
     solution.of(stored)  # array of the energy stored after each hour
-    solution.prices["full"]  # what a kWh more at the end costs
+    solution.prices["full"]  # dual price of the row: cost per kWh that must be stored at the end
 
-``charge``, ``stored`` and what is computed from them are ``Linear``: one row for each step, each a
-sum of variables with coefficients and a constant. Blocks and rows reach the solver in the order in
-which they are added.
+``charge``, ``stored`` and expressions of them are ``Linear`` objects. Such an object has one row
+for each step; a row is a constant plus a sum of variables with coefficients. The solver receives
+blocks and rows in the order in which they were added.
 """
 
 from __future__ import annotations
@@ -36,20 +36,21 @@ _ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("highs-ds", {}),
     ("highs-ipm", {}),
 )
-"""Methods and options in the order in which they are tried.
+"""HiGHS methods and options, in the order in which they are tried.
 
-The dual simplex method takes a third less time with Devex pricing. Presolve now and then takes
-fifty times as long as all the rest, and the interior point method always several times as long.
+The dual simplex method without presolve and with Devex pricing is the fastest. Devex pricing saves
+a third of the time. Presolve sometimes takes fifty times as long as the rest of the solution. The
+interior point method always takes several times as long as the dual simplex method.
 """
 _RELIEFS = (0.0, 1e-7, 1e-6)
-"""Amounts by which right-hand sides are raised in turn, as a share of the largest of them.
+"""Relaxations of the upper limits of rows, tried in order, as a share of the largest limit.
 
-Rows that hold only up to rounding, such as those of a battery that is full at the beginning, can
-keep the solver from recognising an optimum. Raised right-hand sides allow more, so the least value
-stays a bound.
+Rows that hold only up to rounding errors, such as those of an initially full battery, can prevent
+the solver from recognising an optimum. Relaxed limits allow more solutions, so the minimum is still
+a lower bound.
 """
 _INFEASIBLE = 2
-"""Status of ``scipy.optimize.linprog`` for rows that contradict each other."""
+"""Status that ``scipy.optimize.linprog`` returns for an infeasible problem."""
 
 
 class InfeasibleError(Exception):
@@ -58,10 +59,10 @@ class InfeasibleError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Linear expressions of variables, one for each of m rows: matrices @ variables + constant.
+    """Linear expressions of variables, one per row: m rows of matrices @ variables + constant.
 
-    Expressions, arrays (m,) and numbers can be added and subtracted; one row is repeated where the
-    other side has more.
+    Expressions, arrays (m,) and numbers can be added and subtracted. An operand with one row is
+    repeated to the number of rows of the other operand.
     """
 
     constant: F64
@@ -103,22 +104,22 @@ class Linear:
         return self + -1.0 * _linear(other)
 
     def __getitem__(self, rows: int | I64 | Mask) -> Linear:
-        """Some of the rows, by number or by a mask (m,)."""
+        """Select rows by index or by a boolean mask (m,)."""
         index = np.arange(len(self))[np.atleast_1d(rows)]
         return Linear(self.constant[index], {n: matrix[index] for n, matrix in self.terms.items()})
 
     def sum(self) -> Linear:
-        """Sum of all rows, one row."""
+        """Return the sum of all rows as an expression with one row."""
         return self._times(np.ones((1, len(self))))
 
     def shifted(self, steps: int) -> Linear:
-        """The value of ``steps`` rows before each row; 0 where there is none."""
+        """Return rows shifted by ``steps``: row i is the old row i - steps, or 0 without one."""
         from scipy import sparse
 
         return self._times(sparse.eye_array(len(self), k=-min(steps, len(self)), format="csr"))
 
     def before(self, start: Linear | float) -> Linear:
-        """The value of the row before each row; ``start`` before the first."""
+        """Return the predecessor of each row; the predecessor of the first row is ``start``."""
         first = np.zeros((len(self), 1))
         first[0] = 1.0
         return self.shifted(1) + _linear(start)._times(first)
@@ -127,7 +128,7 @@ class Linear:
         return self if len(self) == rows else self._times(np.ones((rows, 1)))
 
     def _times(self, matrix: Matrix) -> Linear:
-        """A matrix times all rows."""
+        """Return a matrix, (k, m), times the m rows."""
         from scipy import sparse
 
         factor = sparse.csr_array(matrix)
@@ -136,17 +137,18 @@ class Linear:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Values of the variables at which a linear programme is least."""
+    """Optimal solution of a linear programme."""
 
     figure: float
-    """The least value of the sum."""
+    """Minimum of the objective."""
     values: Mapping[str, F64]
-    """Values of each block of variables, by its name."""
+    """Optimal values of each block of variables, by the block's name."""
     prices: Mapping[str, F64]
-    """Rise of the figure with the right-hand side of each block of rows, by its name."""
+    """Dual prices: rise of the figure per unit of a row's right-hand side, by name of the block of
+    rows."""
 
     def of(self, expression: Linear) -> F64:
-        """Value of each row of an expression, (m,)."""
+        """Return the value of each row of an expression at the optimum, (m,)."""
         value = expression.constant.copy()
         for name, matrix in expression.terms.items():
             value += matrix @ self.values[name]
@@ -154,7 +156,7 @@ class Solution:
 
 
 class Programme:
-    """A linear programme: minimise a sum over variables within bounds, subject to rows."""
+    """A linear programme: minimises a weighted sum of bounded variables subject to rows."""
 
     def __init__(self) -> None:
         self._sizes: dict[str, int] = {}
@@ -178,12 +180,12 @@ class Programme:
         Args:
             name: Name of the block.
             size: Number of variables, n.
-            lower: Least value of each, (n,).
-            upper: Largest value of each, (n,).
-            cost: What a unit of each adds to the sum, (n,).
+            lower: Lower bound of each variable, (n,) or one number.
+            upper: Upper bound of each variable, (n,) or one number.
+            cost: Coefficient of each variable in the objective, (n,) or one number.
 
         Returns:
-            The variables, (n,).
+            Expressions of the single variables, n rows.
         """
         from scipy import sparse
 
@@ -194,7 +196,7 @@ class Programme:
         return Linear(np.zeros(size), {name: sparse.eye_array(size, format="csr")})
 
     def add_cost(self, name: str, cost: F64) -> None:
-        """Add to the cost of each variable of a block, (n,)."""
+        """Increase the objective's coefficients of a block of variables by ``cost``, (n,)."""
         self._cost[name] = self._cost[name] + cost
 
     def equal(self, name: str, left: Linear, right: Linear | F64 | float) -> None:
@@ -202,8 +204,8 @@ class Programme:
 
         Args:
             name: Name of the block of rows.
-            left: The expressions, (m,).
-            right: What they are equal to, (m,).
+            left: First expression, m rows.
+            right: Second expression, m rows, an array (m,), or a number.
         """
         self._equal[name] = left - right
 
@@ -212,13 +214,13 @@ class Programme:
 
         Args:
             name: Name of the block of rows.
-            left: The lower expressions, (m,).
-            right: The upper expressions, (m,).
+            left: Expression that must not be larger, m rows.
+            right: Expression that must not be smaller, m rows.
         """
         self._at_most[name] = _linear(left) - right
 
     def solve(self) -> Solution:
-        """Find the least sum, and values of the variables that reach it.
+        """Minimise the objective.
 
         Raises:
             InfeasibleError: No values satisfy all rows and bounds.
@@ -259,7 +261,7 @@ class Programme:
         )
 
     def _matrix(self, rows: Mapping[str, Linear]) -> tuple[Matrix | None, F64 | None]:
-        """Coefficients and right-hand sides of blocks of rows; None where there are none."""
+        """Return coefficients and right-hand sides of blocks of rows; None if there are no rows."""
         from scipy import sparse
 
         if not rows:
@@ -276,11 +278,11 @@ class Programme:
 
 
 def _linear(value: Linear | F64 | float) -> Linear:
-    """An expression without variables of an array or a number."""
+    """Return an expression unchanged; convert an array or a number to a constant expression."""
     return value if isinstance(value, Linear) else Linear(np.atleast_1d(np.asarray(value, float)))
 
 
 def _split(values: F64, sizes: Mapping[str, int]) -> dict[str, F64]:
-    """Values end to end, by the names and sizes of their blocks."""
+    """Split concatenated values into blocks of given names and sizes."""
     ends = np.cumsum([*sizes.values()], dtype=np.int64)
     return dict(zip(sizes, np.split(values, ends), strict=False))

@@ -1,4 +1,4 @@
-"""Results: bound, achieved figure and path of data centers, and the value of states at the end."""
+"""Results of the optimisation: bound, best simulated plan, and the value of end states."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from sdc_taichi.types import F64, I64
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """Bound and achieved figure of B data centers over T steps, and the commands that achieve it.
+    """Bound, best simulated figure and best commands of B data centers in a run of T steps.
 
-    Figures are in the unit of the objective, and less is better.
+    Figures are values of the objective; smaller figures are better.
     """
 
     names: tuple[str, ...]
@@ -31,54 +31,57 @@ class Optimum:
     fingerprint: str
     """Fingerprint of configs, inputs and precision (``Simulator.fingerprint``)."""
     objective: Objective
-    """Objective that plans minimise."""
+    """Objective that the plans minimise."""
     agents: tuple[Agent, ...]
-    """Agents that the plans may move."""
+    """Agents that the plans control; the others follow idle commands."""
     start: I64
     """First step of each data center, counted from the beginning of the year, (B,)."""
     seed: I64
-    """Seed of the sampled events of each data center, (B,); 0 where none are sampled."""
+    """Seed of the sampled events of each data center, (B,); 0 without sampled events."""
     steps: int
     """Number of steps, T."""
     scored_from: int
-    """First step that counts."""
+    """Number of the first scored step."""
     inlet_limit_c: F64
-    """Highest inlet that plans may cause where they have a choice, in C, (B,); inf without."""
+    """Highest inlet temperature that plans may cause if another setpoint avoids it, in C, (B,); inf
+    without a limit."""
     idle: F64
     """Figure under idle commands, (B,)."""
     idle_dropped_tasks: F64
-    """Work that finds the queue full under idle commands, in tasks, (B,)."""
+    """Work dropped because the queue is full under idle commands, in tasks, (B,)."""
     bound: F64
-    """No controller that keeps the constraints and ends as it began comes below this figure, (B,);
-    nan if none is known."""
+    """Lower bound of the figure, (B,); nan if there is none. It holds for every controller that
+    satisfies the constraints and ends in the state in which it began."""
     achieved: F64
-    """Lowest figure that the simulator reached and that keeps the constraints, (B,)."""
+    """Lowest figure of the simulated plans that satisfy the constraints, (B,)."""
     alone: Mapping[str, F64]
-    """Lowest figure reached with one agent alone, by its name, (B,) each."""
+    """Lowest figure of simulated plans that move one agent alone, by agent, (B,) each."""
     bound_kinds: tuple[str, ...]
-    """Kind of the bound of each data center: ``bound``, or ``estimate`` or ``none``, and why."""
+    """Kind of each data center's bound: ``bound``, or ``estimate`` or ``none`` and the reason."""
     failures: tuple[tuple[str, ...], ...]
-    """Certificates of each data center that do not hold, in words."""
+    """Constraints that simulated plans of each data center break, in words."""
     certificates: tuple[Mapping[str, float], ...]
-    """Measurements when the simulator ran the plan of each data center, by name."""
+    """Measurements of the simulator for the best plan of each data center, by name."""
     load: F64
-    """Load commands of the achieved path, (T, B)."""
+    """Load commands of the best plan, (T, B)."""
     cooling: F64
-    """Cooling commands of the achieved path, in steps of the setpoint, (T, B)."""
+    """Cooling commands of the best plan, in steps of the setpoint, (T, B)."""
     battery: F64
-    """Battery commands of the achieved path, (T, B)."""
+    """Battery commands of the best plan, (T, B)."""
     bound_of_ends: Callable[[int, Ends], float]
-    """Bound of a data center, by its index, with given ends; nan where there is none."""
+    """Function that returns the bound of a data center, by its index, for given start and end
+    states; nan if there is no bound."""
 
     @property
     def gap_points(self) -> F64:
-        """Distance of the achieved figure from the bound, in % of the idle figure, (B,)."""
+        """Difference between achieved figure and bound, in % of the idle figure, (B,)."""
         return np.asarray(100.0 * (self.achieved - self.bound) / self.idle)
 
     def end_value(self, start_kwh: F64, start_tasks: F64, end_kwh: F64, end_tasks: F64) -> F64:
-        """Least cost of ending as a controller did, beyond that of ending as it began.
+        """Return the minimum cost of reaching a run's end state instead of its start state.
 
-        It is V(start, end) - V(start, start), where V is the bound with given ends.
+        The cost is V(start, end) - V(start, start), where V is the bound for given start and end
+        states.
 
         Args:
             start_kwh: Energy stored at the first scored step, in kWh, (B,).
@@ -87,8 +90,8 @@ class Optimum:
             end_tasks: Work that waits at the end, in tasks, (B,).
 
         Returns:
-            The value in the unit of the objective, (B,); nan where there is no bound and ends
-            differ.
+            The cost in the unit of the objective, (B,); 0 if start and end state are equal, nan if
+            they differ and there is no bound.
         """
         value = np.zeros(len(self.names))
         for i in range(len(self.names)):
@@ -101,19 +104,20 @@ class Optimum:
 
 
 _KWH_SHARES = np.array([0.0, 0.35, 0.65, 0.95])
-"""Energy stored at the nodes of a curve, as a share of capacity; it may never be full."""
+"""Stored energy at the nodes of a curve, as a share of capacity. A full battery is no node, because
+it may be unreachable."""
 _TASK_SHARES = np.array([0, 1, 2, 3, 4, 6, 8, 13]) / 16.0
-"""Work that waits at the nodes of a curve, as a share of the longest queue. The first hours of it
-cost most, and the longest queue may be unreachable."""
+"""Waiting work at the nodes of a curve, as a share of the longest queue. Nodes are dense at short
+queues, where costs change fastest. A full queue is no node, because it may be unreachable."""
 
 
 class BoundOfEnds:
-    """Bounds of data centers with given ends, computed when they are first asked for.
+    """Computes bounds of data centers for given start and end states, and stores them.
 
     Args:
-        task: The data centers.
-        kinds: Kind of the bound of each, B.
-        cache: Keeps them for later; None keeps none.
+        task: The data centers with their inputs and options.
+        kinds: Kind of each data center's bound, B.
+        cache: Cache of bounds on disk; None uses no cache.
     """
 
     def __init__(self, task: Task, kinds: Sequence[str], cache: Cache | None = None) -> None:
@@ -122,7 +126,7 @@ class BoundOfEnds:
         self._known: dict[int, dict[Ends, float]] = {}
 
     def __call__(self, dc: int, ends: Ends) -> float:
-        """Bound of a data center, by its number, with given ends; nan where there is none."""
+        """Return the bound of data center ``dc`` for given end states; nan if there is none."""
         if self._kinds[dc].startswith("none"):
             return float("nan")
         if dc not in self._known:
@@ -140,7 +144,7 @@ class BoundOfEnds:
         return self._task.keys()
 
     def _problem_of(self, dc: int) -> Problem:
-        """Planning problem of a data center; that of the last call is kept."""
+        """Return the planning problem of a data center, and store it for the next call."""
         if self._problem is None or self._problem[0] != dc:
             part = self._task.part([dc])
             self._problem = dc, part.problems()[0]
@@ -154,32 +158,35 @@ def with_tabled_ends(
     progress: Callable[[str, int, int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Optimum:
-    """An optimum that values ends by curves, for many controllers to be compared with it.
+    """Return an optimum that approximates the bound of end states by fast curves.
 
-    What energy stored at the end is worth hardly depends on the work that waits there, nor either
-    of them on the state days before. So the bound with given ends is the sum of two curves, linear
-    between a dozen bounds and beyond the last of them; only its differences between ends mean
-    something. The last segments go on to a full battery and queue, where bounds bend: the last
-    percent of a battery fills so slowly that a kWh there is worth ten of those before, and no more
-    work can wait than may still be put off.
+    The curves serve to compare many controllers. The value of stored energy at the end hardly
+    depends on the work that waits at the end, and neither value depends much on the state days
+    before. The approximate bound is therefore the sum of two piecewise linear curves, through a
+    dozen exact bounds. Only differences of this sum between two end states are meaningful.
 
-    With random ends below these bends (up to 98 % of the battery and 85 % of the queue), values
-    were off by up to 0.015 % of the figure of a week of preset ``corrected``, which is 0.4 % of the
-    achievable. With more flexible work and a battery of 4 h it was 0.3 % and 2 %, for the bill,
-    where the state at the beginning shaves the peak of the demand charge, 0.4 % and 3 %. Errors
-    have either sign, and cancel over many weeks.
+    The last segments are extrapolated to a full battery and a full queue, where the exact bounds
+    are nonlinear. The last percent of a battery fills so slowly that a kWh there is worth ten
+    times as much as the previous ones, and a queue cannot exceed the work that may still be
+    deferred.
+
+    The error was measured at random end states of up to 98 % of the battery and 85 % of the queue.
+    For a week of preset ``corrected`` it was up to 0.015 % of the figure, or 0.4 % of the
+    achievable saving. With more flexible work and a battery of 4 h it was 0.3 % and 2 %. For the
+    bill, whose peak depends on the initial state, it was 0.4 % and 3 %. Errors have both signs and
+    cancel in means of many weeks.
 
     Args:
         optimum: Optimum of the simulator's data centers.
         sim: The simulator.
-        progress: Progress callback ``(stage, done, total)`` in data centers.
-        stop: Returns whether to end the work; called before each data center.
+        progress: Progress callback ``(stage, done, total)``, in data centers.
+        stop: Called before each data center; the work ends if it returns True.
 
     Returns:
-        The optimum; the one given where a queue has no limit.
+        An optimum with approximate end values, or ``optimum`` itself if a queue has no limit.
 
     Raises:
-        StoppedError: ``stop`` was true; what the optimum keeps is kept.
+        StoppedError: ``stop`` returned True; bounds that were computed stay in the cache.
     """
     limits = queue_limit_tasks(sim.fleet)
     if np.any(limits >= UNLIMITED_TASKS):
@@ -200,7 +207,13 @@ def with_tabled_ends(
 def _ends_curve(
     bound_of: Callable[[Ends], float], most_kwh: float, most_tasks: float
 ) -> Callable[[Ends], float]:
-    """Approximate bound of a data center by what is stored and by what waits at the end."""
+    """Return a function that approximates the bound by stored energy and waiting work at the end.
+
+    Args:
+        bound_of: Exact bound for given start and end states.
+        most_kwh: Stored energy of a full battery, in kWh.
+        most_tasks: Longest queue, in tasks.
+    """
     kwh, tasks = np.unique(most_kwh * _KWH_SHARES), np.unique(most_tasks * _TASK_SHARES)
 
     def exact(end_kwh: float, end_tasks: float) -> float:
@@ -214,7 +227,7 @@ def _ends_curve(
 
 
 def _line(x: float, nodes: F64, values: F64) -> float:
-    """Linear interpolation, that of the last two nodes beyond them."""
+    """Interpolate linearly between nodes; outside the nodes, continue the nearest segment."""
     if len(nodes) == 1:
         return float(values[0])
     i = int(np.clip(np.searchsorted(nodes, x), 1, len(nodes) - 1))
