@@ -79,11 +79,11 @@ def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
     """
     ends = score.start_kwh, score.start_tasks, score.end_kwh, score.end_tasks
     valued = score.figure - optimum.end_value(*ends)
-    room = optimum.idle - optimum.achieved
+    saving = optimum.idle - optimum.achieved
     share = share_of_achievable(valued, optimum.idle, optimum.achieved)
-    total_room = float(room.sum())
-    total = float((optimum.idle - valued).sum()) / total_room if total_room > 0 else float("nan")
-    broken = tuple(tuple(_broken(optimum, score, dc)) for dc in range(len(room)))
+    best = float(saving.sum())
+    total = float((optimum.idle - valued).sum()) / best if best > 0 else float("nan")
+    broken = tuple(tuple(_broken(optimum, score, dc)) for dc in range(len(saving)))
     return Achievement(controller, score.figure, valued, share, total, broken)
 
 
@@ -95,9 +95,9 @@ def share_of_achievable(figures: F64, idle: F64, achieved: F64) -> F64:
         idle: Objective values of idle commands, (B,).
         achieved: Objective values of the optimum's achieved path, (B,); nan if there is none.
     """
-    room = idle - achieved
-    share = np.full(room.shape, np.nan)
-    np.divide(idle - figures, room, out=share, where=room > 0)
+    saving = idle - achieved
+    share = np.full(saving.shape, np.nan)
+    np.divide(idle - figures, saving, out=share, where=saving > 0)
     return share
 
 

@@ -144,9 +144,9 @@ def read_steps(
     for group in _row_groups(run, columns):
         for name, values in parts.items():
             values.append(group[name][:, list(dcs)])
-    whole = {name: np.concatenate(values) for name, values in parts.items()}
+    series = {name: np.concatenate(values) for name, values in parts.items()}
     return [
-        pd.DataFrame({name: values[:, i] for name, values in whole.items()})
+        pd.DataFrame({name: values[:, i] for name, values in series.items()})
         for i in range(len(dcs))
     ]
 
@@ -246,8 +246,8 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
             )
         except (KeyError, TypeError, ValueError):
             steps, highest = np.full((2, 1), np.nan)
-        whole = steps.ndim == 1 and steps.shape == highest.shape and len(steps) > 0
-        if not (whole and np.all((steps >= 0) & (steps <= done)) and np.all(np.isfinite(highest))):
+        flat = steps.ndim == 1 and steps.shape == highest.shape and len(steps) > 0
+        if not (flat and np.all((steps >= 0) & (steps <= done)) and np.all(np.isfinite(highest))):
             raise SdcError(
                 f"{run.steps_path}: sdc_taichi_racks[{dc}] is {shortened(stored[dc])}; valid are "
                 f"hottest_steps, 0..{done}, and inlet_max_c of each rack"

@@ -27,14 +27,14 @@ def with_prices(drivers: Drivers, configs: Sequence[DataCenterConfig]) -> Driver
         return drivers
     per_hour = configs[0].simulation.steps_per_hour
     of_tariff: dict[TariffConfig, F64] = {}
-    known: dict[int, F64] = {}
+    by_id: dict[int, F64] = {}
     for tariff in (config.tariff for config in configs):
         # Copies of a data center share the tariff object; a look-up by id avoids hashing it.
-        if id(tariff) not in known:
+        if id(tariff) not in by_id:
             if tariff not in of_tariff:
                 of_tariff[tariff] = np.repeat(tariff.hourly_prices(), per_hour)
-            known[id(tariff)] = of_tariff[tariff]
-    prices = [known[id(config.tariff)] for config in configs]
+            by_id[id(tariff)] = of_tariff[tariff]
+    prices = [by_id[id(config.tariff)] for config in configs]
     aligned = _aligned(drivers.outdoor_c, prices)
     return replace(drivers, price_per_kwh=fleet_series(prices) if aligned is None else aligned)
 

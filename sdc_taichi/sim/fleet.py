@@ -69,7 +69,7 @@ class HallAir:
     """Weights of the racks' exhausts in the exhaust mix before each rack, for all racks of the
     fleet; copies of a hall share their weights."""
     exhaust_share: F64
-    """Share of exhaust air in each rack's intake at height factor 1, (R,)."""
+    """Share of exhaust air in each rack's intake, for a server of height factor 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit in the supply of each rack of its data center, flat: all racks in
     order, and for each rack the units of its data center."""
@@ -255,7 +255,7 @@ class _Air:
     mix_weights: MixWeights
     """Weights of the racks' exhausts in the exhaust mix before each rack."""
     exhaust_share: F64
-    """Share of exhaust air in each rack's intake at height factor 1, (R,)."""
+    """Share of exhaust air in each rack's intake, for a server of height factor 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
     rack_need_m3s: F64
@@ -330,22 +330,22 @@ def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
     """Build the arrays of each data center's hall, once for data centers with equal halls."""
     cache: dict[Any, _HallArrays] = {}
     # Copies of a data center share section objects; comparing ids avoids slow field comparisons.
-    known: dict[Any, _HallArrays] = {}
+    by_ids: dict[Any, _HallArrays] = {}
     halls = []
     for config in configs:
         # The density of the air depends on the site unless it is configured.
         place = None
         if config.hall.air_density_kg_m3 is None:
             place = config.site.location, config.site.weather_file
-        same = (*map(id, (config.hall, config.servers, config.hvac)), place)
-        if same not in known:
+        ids = (*map(id, (config.hall, config.servers, config.hvac)), place)
+        if ids not in by_ids:
             setpoint = config.hvac.setpoint
             range_c = setpoint.min_c, setpoint.max_c
-            made_of = config.hall, config.servers, config.hvac.crac, range_c, place
-            if made_of not in cache:
-                cache[made_of] = _hall_arrays(config)
-            known[same] = cache[made_of]
-        halls.append(known[same])
+            key = config.hall, config.servers, config.hvac.crac, range_c, place
+            if key not in cache:
+                cache[key] = _hall_arrays(config)
+            by_ids[ids] = cache[key]
+        halls.append(by_ids[ids])
     return halls
 
 

@@ -130,7 +130,8 @@ class HallSums(HallQuantities):
     units_flow_m3s: F64
     """Total airflow of the CRAC units, in m3/s, (B,); 0 with inlet model ``approach``."""
     units_return_c: F64
-    """Return temperature of the CRAC units, in C, (B,); 0 with inlet model ``approach``."""
+    """Temperature of the return air of the CRAC units, in C, (B,); 0 with inlet model
+    ``approach``."""
     units_load_w: F64
     """Heat from return air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in
     quasi-steady halls."""
@@ -553,7 +554,7 @@ class Hall:
         self._has_rows_along_racks = True
 
     def _exhaust(self) -> Any:
-        """Return the racks' exhaust temperatures times strength in the last sweep, by place."""
+        """Return exhaust temperature times strength of each rack after the last sweep, padded."""
         side = self._control["exhaust_side"]
         other_side = self._memory["exhaust_odd_c"], self._memory["exhaust_c"]
         # Usually all data centers have used the same side last.

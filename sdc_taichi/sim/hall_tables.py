@@ -73,7 +73,7 @@ class RackPlaces:
         return int(LANES * self.block_offsets[-1])
 
     def values_of_racks(self, rows: Array) -> Array:
-        """Return a copy of rows by place, (n, places), as rows by rack, (n, R)."""
+        """Copy padded kernel rows, (n, places), to rows by rack without padding, (n, R)."""
         rows, size = rows.reshape(len(rows), -1), len(self.blocks)
         if self.racks_per_dc is None:
             return rows[:, self.of_racks]
@@ -83,7 +83,7 @@ class RackPlaces:
         return parts.copy().view(rows.dtype)
 
     def put(self, row: Array, values: Array) -> None:
-        """Write values by rack, (R,), to a row by place, (places,)."""
+        """Write values by rack, (R,), to a padded kernel row, (places,)."""
         if self.racks_per_dc is None:
             row[self.of_racks] = values
         else:
@@ -268,7 +268,7 @@ def _build_group_inputs(
 
     An entry holds the rows ``GROUP_INPUTS`` of one group of each rack, with racks as lanes.
     """
-    known: dict[Any, int] = {}
+    row_of_block: dict[Any, int] = {}
     blocks_of_hall: dict[int, slice] = {}
     entries, first_row, total = [], np.zeros(len(groups), np.int64), 0
     for dc, (begin, end) in enumerate(pairwise(places.block_offsets)):
@@ -285,11 +285,11 @@ def _build_group_inputs(
             offsets = fleet.group_offsets[first_rack[i] : end_rack + 1] - group_0
             values = rows[:, offsets[0] : offsets[-1]]
             key = (values.tobytes(), (offsets - offsets[0]).tobytes())
-            if key not in known:
-                known[key] = total
+            if key not in row_of_block:
+                row_of_block[key] = total
                 entries.append(_block_entry(rows, offsets, groups[i], dtype))
                 total += int(groups[i])
-            first_row[i] = known[key]
+            first_row[i] = row_of_block[key]
     out = vectors(dtype, total * len(GROUP_INPUTS))
     out[:] = np.concatenate(entries).reshape(out.shape)
     return first_row, out
@@ -361,7 +361,7 @@ def _build_air(
     air = fleet.air
     if air is None:
         return vectors(dtype, 1), vectors(dtype, 1, lanes=DENSE_LANES * LANES), first_mix_weight
-    shares, weights, known, total = [], [], {}, 0
+    shares, weights, first_of_entry, total = [], [], {}, 0
     for dc, (racks, units) in enumerate(
         zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
     ):
@@ -374,15 +374,15 @@ def _build_air(
         if racks > DENSE_RACKS:
             continue
         entry = int(air.steady_state_of_dc[dc])
-        if entry not in known:
-            whole = -(-int(racks) // DENSE_LANES) * DENSE_LANES
-            square = np.zeros((n_places, whole))
-            square[:racks, :racks] = _dense_weights(fleet, dc)
-            by_block = square.reshape(-1, LANES, whole).swapaxes(1, 2)
+        if entry not in first_of_entry:
+            n_sources = -(-int(racks) // DENSE_LANES) * DENSE_LANES
+            padded = np.zeros((n_places, n_sources))
+            padded[:racks, :racks] = _dense_weights(fleet, dc)
+            by_block = padded.reshape(-1, LANES, n_sources).swapaxes(1, 2)
             weights.append(by_block.reshape(-1, DENSE_LANES * LANES))
-            known[entry] = total
+            first_of_entry[entry] = total
             total += len(weights[-1])
-        first_mix_weight[dc] = known[entry]
+        first_mix_weight[dc] = first_of_entry[entry]
     unit_shares = vectors(dtype, sum(map(len, shares)))
     unit_shares[:] = np.concatenate(shares)
     mix_weights = vectors(dtype, max(total, 1), lanes=DENSE_LANES * LANES)
@@ -490,7 +490,7 @@ def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[
 
 
 def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> Array:
-    """Return the rows ``RACK_INPUTS`` by place; every step overwrites the loads."""
+    """Return the padded kernel rows ``RACK_INPUTS``; every step overwrites the loads."""
     air, ones = fleet.air, np.ones(fleet.racks)
     values = {
         "approach_k": fleet.approach_k,

@@ -76,8 +76,8 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
 
     Args:
         tables: Arrays of the kernels.
-        rack_out: Rows ``RACK_OUT`` by place.
-        exhaust: Exhaust temperature times strength of each rack in the last sweep, by place.
+        rack_out: Kernel rows ``RACK_OUT``, padded to whole blocks of racks.
+        exhaust: Exhaust temperature times strength of each rack after the last sweep, padded.
         setpoint_c: Supply setpoint of each CRAC unit, in C, (U,).
     """
     out = dict(zip(RACK_OUT, rack_out.reshape(len(RACK_OUT), -1), strict=True))

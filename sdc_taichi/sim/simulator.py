@@ -53,7 +53,7 @@ class Simulator:
             raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
         inputs = load_drivers(self.fleet.configs) if drivers is None else drivers
-        # None once the simulator is closed.
+        # The inputs are None after ``close``.
         self._drivers: Drivers | None = self._checked_drivers(inputs)
         self._initial_start = inputs.start
         self.precision: Precision = precision
@@ -137,8 +137,8 @@ class Simulator:
         inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
         initial = self._initial_start if drivers is None else drivers.start
         first = initial if start is None else np.asarray(start)
-        whole = first.shape == (self.size,) and first.dtype.kind in "iu"
-        if not whole or np.any((first < 0) | (first > LAST_START)):
+        is_valid = first.shape == (self.size,) and first.dtype.kind in "iu"
+        if not is_valid or np.any((first < 0) | (first > LAST_START)):
             raise ConfigError(
                 f"start {start!r}: valid is one integer of 0..{LAST_START:,} for each of "
                 f"{self.size} data centers"
@@ -347,9 +347,9 @@ class Simulator:
     def _seeds(self, seed: int | Sequence[int] | I64) -> I64:
         """Check a seed argument and return a seed for each data center, (B,)."""
         listed: list[Any] = np.ravel(seed).tolist() if np.ndim(seed) else [seed]
-        whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
+        integers = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
         expected = self.size if np.ndim(seed) else 1
-        if len(listed) != expected or not whole or not all(0 <= x < 2**63 for x in listed):
+        if len(listed) != expected or not integers or not all(0 <= x < 2**63 for x in listed):
             raise ConfigError(
                 f"seed {seed!r}: valid is an integer of 0..2**63 - 1, or one for each of "
                 f"{self.size} data centers"

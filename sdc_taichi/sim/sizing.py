@@ -44,9 +44,9 @@ class Sizing:
     it_airflow_m3s: F64
     """Airflow through the servers at full load and design supply air, in m3/s, (B,)."""
     crac_flow_m3s: F64
-    """Airflow of the CRAC units at full fan speed, in m3/s, (B,)."""
+    """Total airflow of the CRAC units at full fan speed, in m3/s, (B,)."""
     crac_fan_w: F64
-    """Power of the CRAC fans at full speed, in W, (B,)."""
+    """Total power of the CRAC fans at full speed, in W, (B,)."""
     design_outdoor_c: F64
     """Design dry bulb of the site, in C, (B,)."""
     design_wet_bulb_c: F64

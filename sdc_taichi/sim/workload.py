@@ -189,7 +189,7 @@ def due_steps(fleet: Fleet) -> F64:
 
 
 class Workload:
-    """The workload model of a fleet and its queues.
+    """Runs the workload model of a fleet and updates its queues.
 
     Args:
         fleet: B data centers.
