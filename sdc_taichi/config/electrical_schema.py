@@ -15,9 +15,9 @@ from sdc_taichi.types import F64
 class UpsConfig(Section):
     """Losses of the UPS.
 
-    The default is a UPS of 97.0 % at full load, 96.3 % at half and 94.1 % at a quarter (V. Avelar,
-    "Making Large UPS Systems More Efficient", Schneider Electric white paper 108, 2010), which
-    double conversion without a transformer reaches today.
+    The default is a UPS with an efficiency of 97.0 % at full load, 96.3 % at half load and 94.1 %
+    at a quarter (V. Avelar, "Making Large UPS Systems More Efficient", Schneider Electric white
+    paper 108, 2010). Transformerless double-conversion units reach these values today.
     """
 
     no_load_share: Share = 0.01333
@@ -31,9 +31,9 @@ class UpsConfig(Section):
 class DistributionConfig(Section):
     """Losses of transformers, PDUs and wiring between UPS and racks.
 
-    The default is a dry transformer of 300 kVA as the USA have required since 2016 (99.02 % at 35 %
-    of its load, half of its loss without load; 10 CFR 431.196), and 1 % in the wiring at full load
-    (Rasmussen, Schneider Electric white paper 113, 2012).
+    The default is a dry-type transformer of 300 kVA with the efficiency that the USA have required
+    since 2016 (99.02 % at 35 % load, where half of its loss is no-load loss; 10 CFR 431.196), plus
+    a loss of 1 % in the wiring at full load (Rasmussen, Schneider Electric white paper 113, 2012).
     """
 
     no_load_share: Share = 0.0017
@@ -49,32 +49,32 @@ class ElectricalConfig(Section):
 
     losses: Literal["reported", "counted"] = "reported"
     """Treatment of the losses of UPS and distribution: ``counted`` in grid energy, PUE, carbon and
-    cost, or only ``reported`` beside them."""
+    cost, or only ``reported`` separately."""
     capacity_ratio: Annotated[float, Field(ge=1, le=10)] = 1.25
-    """Rated power of UPS and distribution, divided by their load at the design point, 1..10: 1.25
-    for five modules of which four suffice, 2 for two paths of which each suffices."""
+    """Rated power of UPS and distribution divided by their load at the design point, 1..10: 1.25 if
+    four of five modules suffice (N+1), 2 if one of two paths suffices (2N)."""
     ups: UpsConfig = UpsConfig()
     """Losses of the UPS."""
     distribution: DistributionConfig = DistributionConfig()
     """Losses of transformers, PDUs and wiring."""
     grid_limit_kw: Annotated[float, Field(ge=0.1, le=1e8)] | None = None
-    """Most power that the grid connection carries, in kW, 0.1..1e8: from a single server to ten
-    times the largest campus that has been announced; None takes ``grid_limit_ratio``."""
+    """Largest power of the grid connection, in kW, 0.1..1e8: from a single server to ten times the
+    largest campus that has been announced; None uses ``grid_limit_ratio``."""
     grid_limit_ratio: Annotated[float, Field(ge=0.01, le=1000)] | None = None
-    """Most power that the grid connection carries, divided by the facility's power at the design
-    point, 0.01..1,000; None is no limit, where ``grid_limit_kw`` gives none."""
+    """Largest power of the grid connection divided by the facility's power at the design point,
+    0.01..1,000. It applies if ``grid_limit_kw`` is None; if both are None, there is no limit."""
 
 
 Price = Annotated[float, Field(ge=0, le=1e9)]
-"""A price, 0..1e9, which leaves room for currencies of many zeros."""
+"""Price in any currency, 0..1e9; the upper bound also suits currencies with large amounts."""
 DAYS_PER_WEEK = 7
-"""Days of a week, Monday first."""
+"""Number of days of a week, which begins on Monday."""
 WORKING_DAYS = 5
-"""Days from Monday to Friday."""
+"""Number of working days of a week, from Monday to Friday."""
 
 
 class TariffPeriod(Section):
-    """A price for some hours of some days."""
+    """Electricity price for selected hours, days of the week and months."""
 
     months: tuple[Annotated[int, Field(ge=1, le=12)], ...] = tuple(range(1, 13))
     """Months of the period, 1..12."""
@@ -83,10 +83,11 @@ class TariffPeriod(Section):
     from_h: Annotated[int, Field(ge=0, le=23)] = 0
     """Local hour at which the period begins, 0..23."""
     to_h: Annotated[int, Field(ge=1, le=24)] = 24
-    """Local hour at which the period ends, 1..24; one that is not after ``from_h`` is that of the
-    next day, whose early hours count by their own day and month."""
+    """Local hour at which the period ends, 1..24. If it is not after ``from_h``, the period extends
+    past midnight; ``days`` and ``months`` then apply to the hours after midnight by their own
+    date."""
     price_per_kwh: Price
-    """Price of a kWh in the period, which replaces that of the tariff and of earlier periods."""
+    """Price of a kWh in the period. It replaces the price of the tariff and of earlier periods."""
 
     @field_validator("months")
     @classmethod
@@ -96,7 +97,7 @@ class TariffPeriod(Section):
         return value
 
     def hours(self) -> np.ndarray:
-        """Mask of the hours of a year in which the period applies, (8760,)."""
+        """Return a mask of the hours of a year in which the period applies, (8760,)."""
         hour = np.arange(24)
         if self.to_h > self.from_h:
             of_day = (hour >= self.from_h) & (hour < self.to_h)
@@ -109,23 +110,23 @@ class TariffPeriod(Section):
 
 
 class TariffConfig(Section):
-    """Prices of electricity in any one currency, local standard time.
+    """Prices of electricity in one currency, by local standard time.
 
-    The default prices of a kWh have a mean of 0.125, beside the 0.127 $/kWh that commercial
-    customers in the USA paid in 2024 with all charges included (EIA, Electric Power Monthly, table
-    5.3); the default demand charge comes on top.
+    The default prices of a kWh have a mean of 0.125. For comparison, commercial customers in the
+    USA paid 0.127 $/kWh in 2024, all charges included (EIA, Electric Power Monthly, table 5.3). The
+    default demand charge is added to the price of energy.
     """
 
     price_per_kwh: Price | tuple[Price, ...] = (
         *(0.08,) * 7, *(0.12,) * 9, *(0.20,) * 5, *(0.12,) * 3,
     )  # fmt: skip
-    """Price of a kWh: one for all hours, or a list of 24, one for each local hour of the day from
-    midnight on."""
+    """Price of a kWh: one value for all hours, or 24 values, one for each local hour of the day,
+    midnight first."""
     periods: tuple[TariffPeriod, ...] = ()
     """Prices for some months, days of the week and hours; where periods overlap, the later entry
     applies."""
     demand_charge_per_kw: Price = 12.0
-    """Price of each kW of the highest mean power of a step, per month."""
+    """Monthly price per kW of the highest power in the month; powers are means of a step."""
 
     @field_validator("price_per_kwh")
     @classmethod
@@ -135,7 +136,7 @@ class TariffConfig(Section):
         return value
 
     def hourly_prices(self) -> F64:
-        """Price of a kWh in each hour of the year, (8760,)."""
+        """Return the price of a kWh in each hour of the year, (8760,)."""
         prices = np.resize(np.array(self.price_per_kwh), HOURS_PER_YEAR)
         for period in self.periods:
             prices = np.where(period.hours(), period.price_per_kwh, prices)

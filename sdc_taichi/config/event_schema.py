@@ -1,4 +1,4 @@
-"""Sections ``events`` and ``protection``: failures in a run, and how servers protect themselves."""
+"""Sections ``events`` and ``protection``: failures in a run, and protection of hot servers."""
 
 from __future__ import annotations
 
@@ -21,17 +21,19 @@ EventKind = Literal[
 ]
 
 WaveK = Annotated[float, Field(ge=-40, le=40)]
-"""Addition to temperatures outdoors, -40..40 K: the largest departure from the climate on record is
+"""Addition to outdoor temperatures, -40..40 K: the largest recorded deviation from the climate is
 39 K (Dome C, Antarctica, March 2022)."""
 
 DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
 """Duration of an event, 0.001..876,000 h: from a few seconds to a century."""
 
 OutletC = Annotated[float, Field(ge=20, le=120)]
-"""Temperature of the air that leaves servers, 20..120 C: from inlets to what damages any board."""
+"""Outlet air temperature of servers, 20..120 C: from usual inlets to temperatures that damage any
+circuit board."""
 
 LEAST_DRAUGHT_SHARE = 0.01
-"""Least share of its airflow that a rack keeps without fans, as warm air rises through it."""
+"""Smallest airflow of a rack with failed fans, as a share of its normal airflow. It is not 0,
+because warm air rises through the rack."""
 
 _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "crac_down": (),
@@ -50,39 +52,40 @@ PLANT_OF_EVENT: dict[EventKind, Plant] = {
     "dry_cooler_down": "air_cooled",
     "outdoor_air_closed": "air_side",
 }
-"""Plant that has the device of an event; the other kinds happen with every plant."""
+"""Plant that an event requires, by kind of event; kinds that are not listed fit every plant."""
 
 
 class ProtectionConfig(Section):
     """Response of servers to inlets above the allowable range of their class, and to hot outlets.
 
-    Above a limit a rack throttles; above a trip temperature it switches off and loses the work of
-    the step. It stays off until cooling has been in order, and its inlet at most ``restart_c``, for
-    ``restart_hold_min``; then racks start again in stages.
+    Above a limit a rack throttles. Above a trip temperature it switches off and loses the work of
+    the step. It may restart after its cooling has worked, with an inlet of at most ``restart_c``,
+    for ``restart_hold_min``. The racks of a data center then restart in stages.
     """
 
     ashrae_class: Literal["A1", "A2", "A3", "A4"] | None = None
-    """ASHRAE TC 9.9 (2021) class of the servers; the upper end of its allowable range is the limit
-    of the inlets. None is no protection."""
+    """ASHRAE TC 9.9 (2021) class of the servers. The upper end of its allowable range is the limit
+    of inlet temperatures. None means no protection."""
     throttle_share: Share = 0.5
-    """Utilisation that a throttled rack may reach, 0..1."""
+    """Highest utilisation of a throttled rack, 0..1."""
     trip_margin_k: RiseK = 5.0
-    """Inlet above the limit at which a rack switches off, in K."""
+    """Inlet temperature at which a rack switches off minus the inlet limit, in K."""
     restart_c: AirC | None = None
-    """Warmest inlet at which a rack that has switched off starts again, in C; None is midway
-    between the recommended 27 C and the limit of the class."""
+    """Highest inlet temperature at which a rack that has switched off restarts, in C; None means
+    the mean of the recommended 27 C and the limit of the class."""
     outlet_limit_c: OutletC | None = 70.0
-    """Outlet above which a rack throttles, in C; None leaves outlets out. 70 C is the default limit
-    of the exhaust of Dell PowerEdge servers (``ThermalSettings.AirExhaustTemp`` of iDRAC)."""
+    """Outlet temperature above which a rack throttles, in C; None ignores outlets. 70 C is the
+    default exhaust limit of Dell PowerEdge servers (``ThermalSettings.AirExhaustTemp`` of
+    iDRAC)."""
     outlet_trip_c: OutletC = 80.0
-    """Outlet above which a throttled rack switches off, in C. 80 C is the critical threshold of the
-    exhaust sensor of Dell PowerEdge R750 servers."""
+    """Outlet temperature above which a throttled rack switches off, in C. 80 C is the critical
+    threshold of the exhaust sensor of Dell PowerEdge R750 servers."""
     restart_hold_min: Annotated[float, Field(ge=0, le=1440)] = 5.0
-    """Time for which cooling and inlet have to be in order before a rack starts again, in min,
-    0..1,440: from at once to a day."""
+    """Time for which cooling must work and the inlet must be cool enough before a rack restarts, in
+    min, 0..1,440: from no wait to a day."""
     restart_share: Annotated[float, Field(ge=0.001, le=1)] = 0.1
-    """Share of the racks of a data center that start again in a minute, at least one rack in a
-    step, 0.001..1: from a day for a thousand racks to all at once."""
+    """Share of the racks of a data center that restart per minute, 0.001..1: from a thousand
+    minutes for all racks to all at once. At least one rack restarts per step."""
 
     @model_validator(mode="after")
     def _throttles_before_it_trips(self) -> Self:
@@ -95,19 +98,19 @@ class ProtectionConfig(Section):
 
 
 class ScheduledEvent(Section):
-    """A failure or weather event at a known time."""
+    """Failure or weather event at a fixed time."""
 
     kind: EventKind
     """Kind of event."""
     start_h: Annotated[float, Field(ge=0, le=876_000)]
-    """Start of the event after reset, in h, before the end of the run; at most 876,000, a
-    century."""
+    """Start of the event, in h after reset, 0..876,000 (a century); it must be before the end of
+    the run."""
     duration_h: DurationH
     """Duration of the event, in h."""
     unit: Annotated[int, Field(ge=0, le=9_999)] | None = None
-    """CRAC unit that is down, counted from 0, below their number; None is all of them."""
+    """Number of the CRAC unit that fails, counted from 0; None means all units."""
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
-    """Rack whose fans fail, counted from 0, row by row, below their number."""
+    """Number of the rack whose fans fail, counted from 0, row by row."""
     share: Share | None = None
     """Chiller capacity, pumps, tower cells, dry coolers, openings for outdoor air or rack airflow
     that remain, as a share of all, 0..1."""
@@ -123,13 +126,13 @@ class ScheduledEvent(Section):
 class SampledEvent(Section):
     """Failures or weather events at random times: a Poisson process with uniform durations.
 
-    CRAC units and racks are drawn evenly.
+    All CRAC units, or all racks, are equally likely to fail.
     """
 
     kind: EventKind
     """Kind of event."""
     per_year: Annotated[float, Field(ge=1e-6, le=8760)]
-    """Mean number of events in a year, from one in a million years to one an hour."""
+    """Mean number of events per year, from one in a million years to one per hour."""
     duration_h: tuple[DurationH, DurationH]
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
@@ -151,7 +154,7 @@ class EventsConfig(Section):
     """Failures and weather events of a run."""
 
     scheduled: tuple[ScheduledEvent, ...] = ()
-    """Events at known times."""
+    """Events at fixed times."""
     sampled: tuple[SampledEvent, ...] = ()
     """Events at random times."""
 

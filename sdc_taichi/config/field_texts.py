@@ -18,7 +18,7 @@ from sdc_taichi.config.schema import DataCenterConfig
 
 
 def field_names() -> list[str]:
-    """Names of all fields that an override can set, such as ``hvac.setpoint.initial_c``."""
+    """Return the paths of all fields that an override can set, like ``hvac.setpoint.initial_c``."""
     return [
         f"{path}.{name}".lstrip(".")
         for path, model in sections_of("", DataCenterConfig)
@@ -28,11 +28,11 @@ def field_names() -> list[str]:
 
 
 def sections_of(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
-    """Path and schema of a section and of all sections within it.
+    """Yield path and schema of a section and of all its subsections.
 
     Args:
-        path: path of the section; empty for the outermost.
-        model: its schema.
+        path: Path of the section; empty for the top level.
+        model: Schema of the section.
     """
     yield path, model
     for name, field in model.model_fields.items():
@@ -42,17 +42,17 @@ def sections_of(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[B
 
 
 def is_section(entry: dict[str, Any]) -> bool:
-    """Whether an entry of a JSON schema is a section and no field."""
+    """Return True if an entry of a JSON schema is a section, not a field."""
     kinds = entry.get("anyOf", [entry])
     return all("$ref" in kind or "allOf" in kind for kind in kinds)  # the latter of pydantic 2.8
 
 
 def valid_values(entry: dict[str, Any], schema: dict[str, Any]) -> str:
-    """Valid values of a field, as a text.
+    """Return a text that describes the valid values of a field.
 
     Args:
-        entry: entry of the field in the JSON schema of its section.
-        schema: that JSON schema.
+        entry: Entry of the field in the JSON schema of its section.
+        schema: JSON schema of the section.
     """
     if "anyOf" in entry:
         return " or ".join(valid_values(one, schema) for one in entry["anyOf"])
@@ -91,7 +91,7 @@ def _number(value: Any) -> str:
 
 
 def docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Docstring of each field of a section, inherited ones included, on one line."""
+    """Return the docstring of each field of a section, each on one line, by field name."""
     docs: dict[str, str] = {}
     for kind in reversed(model.__mro__):
         if issubclass(kind, BaseModel) and kind is not BaseModel:
@@ -102,7 +102,7 @@ def docstrings(model: type[BaseModel]) -> dict[str, str]:
 
 
 def docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
-    """Docstrings below assignments, by the name assigned to."""
+    """Return the docstrings below assignments, by the name of the assigned variable."""
     docs = {}
     for field, text in itertools.pairwise(body):
         target: ast.expr | None = None
@@ -117,17 +117,19 @@ def docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
 
 
 def commented_yaml(config: DataCenterConfig) -> str:
-    """YAML of a configuration with a comment above each field; it reads back equal.
+    """Return a configuration as YAML with a comment above each field.
+
+    ``load_config`` reads the text back as an equal configuration.
 
     Args:
-        config: the configuration.
+        config: The configuration.
     """
     lines = _commented(config.model_dump(mode="json"), DataCenterConfig, "")
     return "\n".join(lines).replace("``", "`") + "\n"
 
 
 def _commented(values: dict[str, Any], model: type[BaseModel], indent: str) -> list[str]:
-    """Lines of a section, with meaning and valid values of each field."""
+    """Return the lines of a section, with comments on meaning and valid values of each field."""
     schema, docs = model.model_json_schema(), docstrings(model)
     lines = []
     for name, entry in schema["properties"].items():
@@ -145,7 +147,7 @@ def _commented(values: dict[str, Any], model: type[BaseModel], indent: str) -> l
 
 
 def _entry(name: str, value: Any) -> list[str]:
-    """Lines of a field, with lists in brackets."""
+    """Return the YAML lines of a field, with lists in brackets."""
     if not isinstance(value, list | dict):
         return yaml.safe_dump({name: value}).splitlines()
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=72)
@@ -153,5 +155,5 @@ def _entry(name: str, value: Any) -> list[str]:
 
 
 def _comment(text: str, indent: str) -> list[str]:
-    """Comment lines of a text."""
+    """Return a text as wrapped comment lines."""
     return textwrap.wrap(text, 96, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")

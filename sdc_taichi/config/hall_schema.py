@@ -33,35 +33,35 @@ from sdc_taichi.plant.servers import ServerCurves, linear_curve
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
 SERVER_J_PER_K_W = 30.0
-"""Heat capacity of servers divided by their power at full load, in J/(K W): a server of two units,
-which draws some 400 W, was measured to have 12 kJ/K (Ibrahim, Shrivastava, Sammakia, Ghose 2012,
+"""Heat capacity of servers divided by their power at full load, in J/(K W). The measured heat
+capacity of a two-unit server of about 400 W is 12 kJ/K (Ibrahim, Shrivastava, Sammakia, Ghose 2012,
 "Thermal mass characterization of a server at different fan speeds", ITherm)."""
 ROOM_J_PER_K_W = 15.0
-"""Heat capacity of coils, their water and the raised floor, which follow the supply air, divided by
-the servers' power at full load, in J/(K W)."""
+"""Heat capacity of coils, water in the coils and raised floor, whose temperatures follow the supply
+air, divided by the servers' power at full load, in J/(K W)."""
 MOST_RACK_U = 58.0
 """Height of the tallest racks, in units of 44.45 mm."""
 LEAST_INLET_RANGE_K = 5.0
-"""Smallest difference of the two inlets between which server curves are given, in K. Fans speed up
-over about 10 K; with a difference of 1 K, the extrapolated fan power a few kelvins above it would
-be a hundredfold."""
+"""Smallest difference of the two inlet temperatures that define the server curves, in K. Real fans
+reach full speed over about 10 K. With a difference of 1 K, the curves extrapolated by a few kelvins
+would give a hundred times the fan power."""
 RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
-"""A number of rows or racks, 1..10,000,000."""
+"""Number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
-"""CPU power of a server at full load and idle, in W."""
+"""CPU power of a server at full load, and when idle, in W."""
 FullAirflow = Annotated[float, Field(ge=1e-4, le=100)]
 """Airflow of a server at full speed, in m3/s, 1e-4..100."""
 DesignRiseK = Annotated[float, Field(ge=2, le=40)]
 """Temperature rise of the air through a server at the design point, in K, 2..40."""
 RackLength = Annotated[float, Field(ge=0.1, le=5)]
-"""A measure of a rack, in m, 0.1..5; usual racks are about 0.6 m wide, 1.2 m deep and 2.1 m
+"""Dimension of a rack, in m, 0.1..5; usual racks are about 0.6 m wide, 1.2 m deep and 2.1 m
 high."""
 
 
 class LayoutConfig(Section):
-    """Measures of the hall: rows side by side, fronts facing fronts across the cold aisles.
+    """Dimensions of a hall with parallel rows, whose fronts face each other across cold aisles.
 
-    Row 0 lies along the first wall and faces away from it, row 1 faces row 0, and so on.
+    Row 0 is next to the first wall and faces away from it, row 1 faces row 0, and so on.
     """
 
     rack_pitch_m: RackLength = 0.6
@@ -81,9 +81,10 @@ class LayoutConfig(Section):
     ceiling_m: Annotated[float, Field(ge=0.1, le=100)] = 3.6
     """Height of the hall, in m, 0.1..100; taller buildings have storeys."""
     containment: Share = 0.0
-    """Share of the paths from hot to cold aisles that containment closes, 0..1."""
+    """Share of the air paths between hot and cold aisles that containment closes, 0..1."""
     returns: Literal["ceiling", "end_wall"] = "ceiling"
-    """Outlet of warm air: grilles above the hot aisles, or the walls at the row ends."""
+    """Position of the return air openings: in the ceiling above the hot aisles, or in the walls at
+    the row ends."""
 
     @model_validator(mode="after")
     def _racks_fit(self) -> Self:
@@ -95,27 +96,27 @@ class LayoutConfig(Section):
 
 
 class RecirculationConfig(Section):
-    """How exhaust air reaches the inlets of the racks."""
+    """Recirculation of exhaust air to the inlets of the racks."""
 
     decay_m: LengthM = 3.0
-    """Length over which the exhaust of another rack loses weight by a factor of e, in m."""
+    """Path length at which the weight of another rack's exhaust falls to 1/e, in m."""
     cutoff: Annotated[float, Field(ge=0, le=0.01)] = 1e-4
     """Smallest weight of a source, as a share of the sum of weights of a rack in the middle of the
     hall, in halls of more than 64 racks; 0 keeps all sources."""
     matrix_file: FileName | None = None
-    """File (.npz, .csv) with the matrix R or D of a CFD study, in place of the weights that follow
-    from the layout; None is the layout."""
+    """File (.npz, .csv) with the matrix R or D of a CFD study, which replaces the weights of the
+    layout; None uses the layout."""
     matrix_kind: Literal["R", "D"] | None = None
-    """Kind of the matrix in a .csv file; None for .npz files, which name it."""
+    """Kind of the matrix in a .csv file; None for .npz files, which contain the kind."""
     calibrate: Literal["rack", "row", "hall", "none"] | None = None
-    """Approach temperatures that recirculation is scaled to: those of each rack; their means over
-    each row or over the hall, within which racks differ by the layout or the matrix file; or
-    ``none``, which keeps those that follow from the matrix file. None is ``none`` with a matrix
-    file and ``row`` without one."""
+    """Approach temperatures to which recirculation is scaled: those of each ``rack``, or the means
+    of each ``row`` or of the ``hall``, within which racks differ by the layout or the matrix file.
+    ``none`` does not scale a matrix file. None means ``none`` with a matrix file and ``row``
+    without one."""
 
     @property
     def scaled_to(self) -> Literal["rack", "row", "hall", "none"]:
-        """Approach temperatures that recirculation is scaled to, see ``calibrate``."""
+        """Approach temperatures to which recirculation is scaled, see ``calibrate``."""
         return self.calibrate or ("row" if self.matrix_file is None else "none")
 
     @model_validator(mode="after")
@@ -133,30 +134,32 @@ class RecirculationConfig(Section):
 
 
 class ServerGroup(Section):
-    """Equal servers of a rack, which are computed once."""
+    """Group of equal servers in a rack, whose state is computed once."""
 
     count: Count
     """Number of servers."""
     full_w: ServerW
-    """CPU power of one server at full load and a power ratio of 1, in W."""
+    """CPU power of one server at full load where its power curve has the value 1, in W."""
     idle_w: IdleW
-    """Least CPU power of one server, in W."""
+    """Lowest CPU power of one server, in W."""
     load_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Load of a server relative to the mean of its rack, by count, at little load; at most twice
-    that mean."""
+    """Relative load of a server at low load of its rack. It must be at most twice the mean of all
+    servers of the rack."""
     inlet_offset_k: DifferenceK = 0.0
-    """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
+    """Inlet temperature of a server minus that of its rack, due to its height in the rack, in K."""
     full_airflow_m3s: FullAirflow | None = None
-    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
-    to ten racks in one; None is that of ``servers.fan_full_airflow_m3s``."""
+    """Airflow of one server at an airflow ratio of 1, in m3/s, 1e-4..100: from the fan of a laptop
+    to ten racks; None uses ``servers.fan_full_airflow_m3s``."""
     design_rise_k: DesignRiseK | None = None
-    """Temperature rise of the air through the server at the design point, in K, 2..40, in place of
-    ``full_airflow_m3s``: less needs extreme airflow, and more damages the server."""
+    """Temperature rise of the air through the server at the design point, in K, 2..40, as an
+    alternative to ``full_airflow_m3s``. A smaller rise needs extreme airflow, a larger one damages
+    the server."""
     fan_w: IdleW | None = None
-    """Fan power of one server at ``servers.fan_reference_ratio``, in W; None is by ``servers``."""
+    """Fan power of one server at ``servers.fan_reference_ratio``, in W; None uses the values of
+    section ``servers``."""
     height_u: Annotated[float, Field(ge=0.1, le=58)] | None = None
     """Height of one server in units of 44.45 mm, 0.1..58: from a card in a chassis to the tallest
-    racks; None is as high as a server of one unit."""
+    racks; None means one unit."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -171,10 +174,10 @@ class ServerGroup(Section):
 
 
 class RackType(Section):
-    """A type of rack, by the servers in it."""
+    """Type of rack, defined by its servers."""
 
     servers: Annotated[tuple[ServerGroup, ...], Field(min_length=1)]
-    """Servers of the rack from the floor up: one group, or several."""
+    """Server groups of the rack, from the floor up."""
 
     @field_validator("servers", mode="before")
     @classmethod
@@ -183,14 +186,14 @@ class RackType(Section):
 
 
 class RackRange(Section):
-    """A range of places of the hall whose racks are of one type."""
+    """Range of rows and places whose racks are of one type."""
 
     type: Name
     """Name of the type, one of ``rack_types``."""
     rows: Text | None = None
-    """Rows, counted from 0, such as 3, 0-5 or "0-2, 6"; None is all."""
+    """Rows, counted from 0, such as 3, 0-5 or "0-2, 6"; None means all rows."""
     racks: Text | None = None
-    """Places in these rows, counted from 0, likewise; None is all."""
+    """Places in these rows, counted from 0, such as 3, 0-5 or "0-2, 6"; None means all places."""
 
     @field_validator("rows", "racks", mode="before")
     @classmethod
@@ -208,17 +211,17 @@ class RackRange(Section):
 
 
 def _is_in(shape: tuple[int, ...], part: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Mask of the places of racks, of a shape, that an index selects."""
+    """Return a mask of the given shape that is True at the places that ``part`` selects."""
     out = np.zeros(shape, bool)
     out[part] = True
     return out
 
 
 def _listed(field: str, text: str | None, count: int) -> list[int]:
-    """Numbers of a text such as "0-2, 6", or all of ``count``.
+    """Return the numbers in a text such as "0-2, 6"; None means 0..count - 1.
 
     Raises:
-        ValueError: naming the field and numbers that are not in 0..count - 1.
+        ValueError: A number is not in 0..count - 1; the message names the field.
     """
     numbers: list[int] = []
     for part in (text or f"0-{count - 1}").split(","):
@@ -233,57 +236,59 @@ def _listed(field: str, text: str | None, count: int) -> list[int]:
 
 
 class HallConfig(Section):
-    """Rows of racks, their approach temperatures, and how many servers they hold."""
+    """Rows of racks, their number of servers, and their approach temperatures."""
 
     rows: RackCount
     """Number of rows of racks."""
     racks_per_row: RackCount
     """Number of racks of each row."""
     servers_per_rack: Count | tuple[Count, ...] = 200
-    """Number of servers of a rack: one for all racks, or one per rack. Racks of ``rack_types`` and
-    of ``servers.groups`` have their own."""
+    """Number of servers of a rack: one value for all racks, or one per rack. ``rack_types`` and
+    ``servers.groups`` have their own numbers of servers."""
     rack_types: dict[Name, RackType] = Field(default={})
-    """Types of racks by their names, in place of ``servers.power_w`` and ``servers.groups``."""
+    """Types of racks by name, as an alternative to ``servers.power_w`` and ``servers.groups``."""
     rack_plan: tuple[RackRange, ...] = ()
-    """Places of each type of rack; with a single type no plan is needed."""
+    """Rows and places of each type of rack; not required for a single type."""
     capacity_mw: Annotated[float, Field(ge=1e-6, le=1e5)] | None = None
-    """IT nameplate power that the number of servers is scaled to, in MW, from a server of 1 W to
-    1e5, more than all data centers of the world draw; None keeps ``servers_per_rack``."""
+    """IT nameplate power to which the number of servers is scaled, in MW, 1e-6..1e5: from a server
+    of 1 W to more than all data centers of the world; None does not scale it."""
     inlet_model: Literal["approach", "recirculation"] = "approach"
-    """Source of rack inlets: given approach temperatures, or the exhaust air of the racks."""
+    """Model of rack inlet temperatures: constant approach temperatures, or mixing of supply air
+    with recirculated exhaust air."""
     supply_approach_k: RiseK | tuple[RiseK, ...]
-    """Rack inlet above the CRAC supply at the design point, in K: one for all racks, or one per
-    rack."""
+    """Rack inlet minus CRAC supply temperature at the design point, in K: one value for all racks,
+    or one per rack."""
     supply_approach_limits_k: Annotated[tuple[RiseK, RiseK], Ordered] | None = None
-    """Lowest and highest supply approach, which bound ``supply_approach_k``, in K; None is no
-    bounds."""
+    """Lowest and highest supply approach, to which ``supply_approach_k`` is clipped, in K; None
+    does not clip it."""
     return_approach_k: DifferenceK | tuple[DifferenceK, ...]
-    """CRAC return air above the rack outlet, in K, negative where supply air bypasses the racks:
-    one for all racks, or one per rack."""
+    """CRAC return air minus rack outlet temperature, in K: one value for all racks, or one per
+    rack. It is negative where supply air bypasses the racks."""
     design_supply_c: AirC = 23.0
-    """Supply air at the design point, in C, at which the approach temperatures hold and devices are
-    sized for full load; limits of the setpoint bound only actions. With approach temperatures of
-    5 K, 23 C brings inlets to 28 C, the warm end of ``servers.inlet_range_c``."""
+    """Supply air temperature at the design point, in C, for which approach temperatures are defined
+    and devices are sized; the limits of the setpoint apply to actions only. With approach
+    temperatures of 5 K, the default gives inlets of 28 C, the warm end of
+    ``servers.inlet_range_c``."""
     layout: LayoutConfig = LayoutConfig()
-    """Measures of the hall."""
+    """Dimensions of the hall."""
     recirculation: RecirculationConfig = RecirculationConfig()
-    """How exhaust air reaches rack inlets, for inlet model ``recirculation``."""
+    """Recirculation of exhaust air, for inlet model ``recirculation``."""
     height_zones: Annotated[int, Field(ge=1, le=100)] = 5
-    """Number of zones over the height of a rack that each share an inlet temperature, for inlet
+    """Number of zones over the height of a rack, each with its own inlet temperature, for inlet
     model ``recirculation``, 1..100; the tallest racks have 58 units."""
     height_gradient: Annotated[float, Field(ge=0, lt=1)] = 0.4
-    """Relative rise of the recirculated share of the intake from the middle of a rack to its top,
-    and its fall to the floor, 0..1."""
+    """Relative increase of the exhaust share of the intake from the middle of a rack to its top,
+    and equal decrease from the middle to the floor, 0..1."""
     room_heat_capacity_kj_per_k_per_server: Annotated[float, Field(ge=0.01, le=1e5)] | None = None
-    """Heat capacity of coils, floor and all else that follows the supply air, in kJ/K per server,
-    0.01..1e5: from 10 l of air to 100 t of concrete; None is 15 J/K per W of the servers' power at
-    full load."""
+    """Heat capacity of coils, floor and other parts whose temperature follows the supply air, in
+    kJ/K per server, 0.01..1e5: from 10 l of air to 100 t of concrete; None means 15 J/K per W of
+    the servers' power at full load."""
     air_density_kg_m3: Annotated[float, Field(ge=0.4, le=1.6)] | None = None
     """Density of the air at all temperatures, in kg/m3, 0.4..1.6: from the summit of Mount Everest
-    to sea level at -50 C; None lets it follow from the height of the site above sea level and the
+    to sea level at -50 C; None computes it from the height of the site above sea level and the
     temperature of the air."""
     air_heat_capacity_j_per_kg_k: Annotated[float, Field(ge=990, le=1200)] = 1006.0
-    """Specific heat capacity of the air, in J/(kg K), 990..1,200: from dry air to air of 100 g of
+    """Specific heat capacity of the air, in J/(kg K), 990..1,200: from dry air to air with 100 g of
     water per kg."""
 
     @property
@@ -292,15 +297,15 @@ class HallConfig(Section):
         return self.rows * self.racks_per_row
 
     def __hash__(self) -> int:
-        """Hash of all fields, of ``rack_types`` by their names and types."""
+        """Return a hash of all fields; ``rack_types`` enters as a tuple of names and types."""
         values = {**self.__dict__, "rack_types": tuple(self.rack_types.items())}
         return hash(tuple(values.items()))
 
     def rack_type_names(self) -> tuple[str, ...]:
-        """Name of the type of every rack, (R,); none without ``rack_types``.
+        """Return the name of the type of every rack, (R,); empty without ``rack_types``.
 
         Raises:
-            ValueError: a type that is not known, or racks of two types or of none.
+            ValueError: A type is unknown, or a rack has two types or none.
         """
         names, plan = list(self.rack_types), self.rack_plan
         if len(names) == 1 and not plan:
@@ -333,7 +338,7 @@ class HallConfig(Section):
         return tuple(names[i] for i in at.reshape(-1)) if names else ()
 
     def rack_approach_k(self) -> np.ndarray:
-        """Supply approach temperature of every rack within its limits, in K, (R,)."""
+        """Return the supply approach temperature of every rack, clipped to its limits, K, (R,)."""
         approach_k = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
         limits = self.supply_approach_limits_k
         return approach_k.copy() if limits is None else np.asarray(np.clip(approach_k, *limits))
@@ -371,61 +376,62 @@ class ServerConfig(Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
     power_w: tuple[PowerPair, ...] | None = None
-    """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. Without
-    it and without groups a server draws 150 W at full load and 10 W idle."""
+    """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. If
+    neither ``power_w`` nor ``groups`` is set, it is 150 W at full load and 10 W when idle."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
-    """Server groups, in place of ``power_w`` and ``hall.servers_per_rack``: one entry for all
-    racks, or one per rack. ``hall.rack_types`` name them."""
+    """Server groups, which replace ``power_w`` and ``hall.servers_per_rack``: one entry for all
+    racks, or one per rack. ``hall.rack_types`` is an alternative with named types."""
     cpu_power_ratio_lb: tuple[PowerRatio, PowerRatio] = (0.01, 1.00)
-    """CPU power over full power at the coldest inlet of ``inlet_range_c``: at no load, and at full
-    load."""
+    """CPU power divided by full power at the coldest inlet of ``inlet_range_c``: at no load, and at
+    full load."""
     cpu_power_ratio_ub: tuple[PowerRatio, PowerRatio] = (0.03, 1.02)
-    """CPU power over full power at the warmest inlet of ``inlet_range_c``: at no load, and at full
-    load."""
+    """CPU power divided by full power at the warmest inlet of ``inlet_range_c``: at no load, and at
+    full load."""
     cpu_slope_offset_per_k: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """Addition to the slope of CPU power over full power against the inlet, in 1/K, -1..1: a kelvin
-    changes no server's power by more than that at full load."""
+    """Addition to the slope of CPU power divided by full power against the inlet temperature, in
+    1/K, -1..1: no real server is as sensitive as the bounds."""
     inlet_range_c: Annotated[tuple[AirC, AirC], Ordered] = (16.0, 28.0)
-    """Coldest and warmest inlet, between which the curves are given, in C; at least 5 K apart, as
-    the curves go on as straight lines beyond both."""
+    """Coldest and warmest inlet temperature, at which the ratios of power and airflow are defined,
+    in C. They must differ by at least 5 K, because curves are extrapolated linearly."""
     curve_limit_c: AirC | None = 45.0
-    """Inlet above which power and airflow no longer rise (upper limit of ASHRAE class A4), in C;
-    without a limit, None, a room that cannot be cooled draws ever more power."""
+    """Inlet temperature above which power and airflow no longer rise, in C; the default is the
+    upper limit of ASHRAE class A4. None means no limit; the power in a room without cooling then
+    grows without bound."""
     fan_airflow_ratio_lb: tuple[FlowRatio, FlowRatio] = (0.01, 0.225)
-    """Server airflow over full airflow at the coldest inlet of ``inlet_range_c``: at no load, and
-    at full load."""
+    """Server airflow divided by full airflow at the coldest inlet of ``inlet_range_c``: at no load,
+    and at full load."""
     fan_airflow_ratio_ub: tuple[FlowRatio, FlowRatio] = (0.225, 1.0)
-    """Server airflow over full airflow at the warmest inlet of ``inlet_range_c``: at no load, and
-    at full load."""
+    """Server airflow divided by full airflow at the warmest inlet of ``inlet_range_c``: at no load,
+    and at full load."""
     fan_model: Literal["linear", "released"] = "linear"
-    """Airflow ratio against inlet temperature and load: as the ratios above give it, or scaled as
-    in the released SustainDC."""
+    """Airflow ratio as a function of inlet temperature and load: linear between the ratios above,
+    or scaled as in the released SustainDC."""
     fan_airflow_ratio_limits: Annotated[tuple[FlowRatio, FlowRatio], Ordered] | None = None
-    """Lowest and highest airflow ratio; None has only the lower limit 0, since fans never blow
+    """Lowest and highest airflow ratio. None sets only the lower limit 0, because fans never blow
     backwards."""
     fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
-    """Exponent of fan power over the airflow ratio, 1..3."""
+    """Exponent of the airflow ratio in the fan power, 1..3."""
     fan_full_airflow_m3s: FullAirflow | None = 0.051
-    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
-    to ten racks in one; None is in proportion to the power of a server, as much as the supply and
-    return approach temperatures close on at the design point."""
+    """Airflow of one server at an airflow ratio of 1, in m3/s, 1e-4..100: from the fan of a laptop
+    to ten racks. None makes it proportional to the power of a server, such that the heat balance of
+    the hall is satisfied at the design point."""
     fan_reference_ratio: Annotated[float, Field(ge=0.01, le=10)] = 1.0
     """Airflow ratio at which the fans of a server draw ``fan_reference_w``, 0.01..10: from fans
     that hardly turn to ten times full airflow."""
     fan_reference_w: IdleW | None = 10.0
-    """Fan power of one server at the reference airflow ratio, in W; None is in proportion to its
-    power, by ``fan_reference_share``."""
+    """Fan power of one server at the reference airflow ratio, in W; None uses
+    ``fan_reference_share``."""
     fan_reference_share: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Fan power of a server at the reference airflow ratio over its CPU power at full load, 0..1,
-    in place of ``fan_reference_w``: at 1, fans draw as much as all that they cool."""
+    """Fan power of a server at the reference airflow ratio divided by its CPU power at full load,
+    0..1, as an alternative to ``fan_reference_w``; at 1, fans draw as much power as the CPUs."""
     outlet_model: Literal["server", "rack", "released"] = "server"
-    """Outlet temperature from a heat balance per server, from one per rack, or from the fit of the
-    released SustainDC."""
+    """Model of outlet temperatures: heat balance of each server, heat balance of each rack, or the
+    fit of the released SustainDC."""
     heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] | None = None
-    """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal; None is 30
+    """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal; None means 30
     J/K per W of its power at full load."""
     heat_exchange_effectiveness: WorkingShare = 0.95
-    """Effectiveness of the heat exchange between the mass of a server and the air that passes it,
+    """Effectiveness of the heat exchange between a server and the air that flows through it,
     0.01..1."""
 
     @property
@@ -435,10 +441,10 @@ class ServerConfig(Section):
 
     @property
     def curves(self) -> ServerCurves:
-        """Coefficients of power and airflow against inlet temperature and load.
+        """Coefficients of power and airflow as functions of inlet temperature and load.
 
-        Fan model ``released`` scales slope by 10, offset by 5 and load shift by 5 (shift per 20 %
-        of load), as the released SustainDC code does.
+        As in the released SustainDC code, fan model ``released`` multiplies the slope by 10 and the
+        offset by 5. It also multiplies the load shift by 5, as if it were per 20 % of load.
         """
         cpu_slope, cpu_offset, cpu_shift = linear_curve(
             self.inlet_range_c, self.cpu_power_ratio_lb, self.cpu_power_ratio_ub

@@ -12,24 +12,27 @@ from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.plant.plants import PLANTS
 
 LEAST_USUAL_SERVER_W = 20.0
-"""Servers of less power at full load are rare, while 1..20 is the power of large ones in kW."""
+"""Smallest usual power of a server at full load, in W. Smaller values are probably in kW."""
 MOST_USUAL_RACK_W = 60e3
-"""Racks of more power are rarely cooled by air alone: about 3 m3/s pass their doors at 15 K."""
+"""Largest usual power of an air-cooled rack, in W; with a temperature rise of 15 K, its airflow is
+about 3 m3/s."""
 MOST_USUAL_COP = 15.0
-"""Chillers with magnetic bearings reach about 12 at their reference point."""
+"""Largest usual reference COP of water-cooled chillers; the best ones, with magnetic bearings,
+reach about 12."""
 MOST_USUAL_AIR_COOLED_COP = 4.5
-"""Air-cooled chillers reach about 4 at 35 C outdoors."""
+"""Largest usual reference COP of air-cooled chillers; the best ones reach about 4 at 35 C."""
 USUAL_SETPOINTS_C = {"supply": (10.0, 35.0), "return": (18.0, 50.0)}
-"""Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C. Return
-air is some 10 to 15 K warmer."""
+"""Lowest and highest usual setpoint of supply air and of return air, in C. Colder supply air causes
+condensation, and 35 C is the limit of ASHRAE class A2. Return air is 10 to 15 K warmer."""
 LEAST_USUAL_PUMP_EFFICIENCY = 0.2
-"""Even small circulators reach a fifth."""
+"""Smallest usual pump efficiency, which even small circulators reach."""
 LEAST_USUAL_GRID_RATIO = 0.5
-"""A connection for less than half of the design power is overloaded in most hours."""
+"""Smallest usual grid limit divided by the design power of the facility; a smaller limit would be
+exceeded in most hours."""
 
 
 def odd_values(config: DataCenterConfig) -> Iterator[str]:
-    """Messages about unusual values of a configuration, with field, value and usual values."""
+    """Yield messages about unusual values: each names field, value and usual values."""
     yield from _odd_servers(config)
     chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
     dry = PLANTS[config.hvac.plant_in_use].dry
@@ -62,15 +65,15 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
-    """Warn about odd values of data centers, once for each value that several of them share.
+    """Warn about unusual values of data centers, once for each value that several of them share.
 
     Warns:
-        OddInputWarning: for each odd value.
+        OddInputWarning: One warning for each unusual value.
     """
     texts_of: dict[tuple[int, ...], list[str]] = {}
     messages: list[tuple[str, list[str]]] = []
     for config in configs:
-        # Copies share the sections themselves.
+        # Copies of a data center share section objects, so each section is checked only once.
         sections = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
         if sections not in texts_of:
             texts_of[sections] = [*odd_values(config)]
@@ -79,13 +82,13 @@ def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
 
 
 def warn_of(messages: Iterable[tuple[str, Sequence[str]]]) -> None:
-    """Warn about odd data centers, once for each message that several of them share.
+    """Warn about data centers with unusual values, once for each message that several share.
 
     Args:
-        messages: name of each data center, and the messages about it.
+        messages: Name of each data center, and the messages about it.
 
     Warns:
-        OddInputWarning: for each message.
+        OddInputWarning: One warning for each message.
     """
     names: dict[str, list[str]] = {}
     for name, texts in messages:
@@ -97,7 +100,7 @@ def warn_of(messages: Iterable[tuple[str, Sequence[str]]]) -> None:
 
 
 def _odd_servers(config: DataCenterConfig) -> Iterator[str]:
-    """Messages about servers and racks of unusual power."""
+    """Yield messages about servers and racks of unusual power."""
     servers, types = config.servers, config.hall.rack_types
     listed_w, field = [full_w for full_w, _ in servers.power_pairs], "servers.power_w"
     if types:
