@@ -1,4 +1,4 @@
-"""Configurations from presets, files, overrides and plain values."""
+"""Readers of configurations from presets, files, overrides and plain values."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _REPLACES: dict[str, dict[str, Any]] = {
     "servers.fan_reference_w": {"servers.fan_reference_share": None},
     "servers.fan_reference_share": {"servers.fan_reference_w": None},
 }
-"""Fields that replace inherited ones, and the values of the replaced fields."""
+"""Fields that exclude others: by path, the paths and neutral values of the excluded fields."""
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that come with the package."""
+    """Return the names of the presets that are part of the package."""
     folder = resources.files("sdc_taichi.configs")
     return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
@@ -43,14 +43,14 @@ def load_config(
     """Read a preset, a YAML file or a SustainDC ``dc_config.json``.
 
     Args:
-        source: a preset name (see ``preset_names``), a path to YAML with the schema of
-            ``DataCenterConfig``, which may name a preset to start from under ``extends``, or a path
-            to the SustainDC JSON format, which starts from preset ``sustaindc``. None is
+        source: Name of a preset (see ``preset_names``) or path of a file. A YAML file has the
+            schema of ``DataCenterConfig`` and may name a preset to start from under ``extends``. A
+            file in the SustainDC JSON format starts from preset ``sustaindc``. None means preset
             ``corrected``.
-        overrides: ``a.b=c`` assignments, applied last; ``c`` is read as YAML.
+        overrides: ``a.b=c`` assignments, applied last; ``c`` is parsed as YAML.
 
     Raises:
-        ConfigError: naming the file, the key, the value and what would be valid.
+        ConfigError: A value is invalid; the message names file, key, value and valid values.
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides {shortened(overrides)}: valid is a list of section.key=value")
@@ -61,27 +61,27 @@ def load_config(
 
 
 def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCenterConfig:
-    """A config of plain values, section by section.
+    """Build a configuration from plain values.
 
     Args:
-        values: content of a YAML file with the schema of ``DataCenterConfig``.
-        label: where the values come from, at the start of every message.
+        values: Content of a YAML file with the schema of ``DataCenterConfig``.
+        label: Source of the values, with which every error message begins.
 
     Raises:
-        ConfigError: naming the key, the value and what would be valid.
+        ConfigError: A value is invalid; the message names key, value and valid values.
     """
     return validated(DataCenterConfig, values, label)
 
 
 def apply_overrides(config: DataCenterConfig, overrides: Sequence[str]) -> DataCenterConfig:
-    """A copy of a config with assignments as the command line takes them.
+    """Return a copy of a configuration with assignments in the syntax of the command line.
 
     Args:
-        config: the config to copy.
-        overrides: ``a.b=c`` assignments, applied in turn; ``c`` is read as YAML.
+        config: Configuration to copy.
+        overrides: ``a.b=c`` assignments, applied in their order; ``c`` is parsed as YAML.
 
     Raises:
-        ConfigError: naming the assignment, or the key, the value and what would be valid.
+        ConfigError: An assignment is invalid; the message names it, or key, value and valid values.
     """
     values = config.model_dump(mode="json")
     for override in overrides:
@@ -90,18 +90,18 @@ def apply_overrides(config: DataCenterConfig, overrides: Sequence[str]) -> DataC
 
 
 def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCenterConfig:
-    """A copy of a config with other values at some paths, validated anew.
+    """Return a validated copy of a configuration with new values at some paths.
 
     ``with_values(config, {"hvac.setpoint.initial_c": 20, "hall.supply_approach_k.2": 5.5})``
 
     Args:
-        config: the config to copy.
-        assigned: dotted path of a field, or of a list entry by its index, to its new value; values
-            are plain, as in a YAML file. A section is replaced as a whole: fields that its value
-            does not give take their defaults.
+        config: Configuration to copy.
+        assigned: Plain values, as in a YAML file, by the dotted path of a field or of a list entry.
+            A section is replaced as a whole; fields that are missing in its new value take their
+            defaults.
 
     Raises:
-        ConfigError: naming the path, or the key, the value and what would be valid.
+        ConfigError: A value is invalid; the message names path or key, value and valid values.
     """
     if not isinstance(assigned, Mapping) or not all(isinstance(path, str) for path in assigned):
         raise ConfigError(
@@ -115,9 +115,9 @@ def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCe
 
 
 def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
-    """Values of a config, ready to be changed and validated: these sections as mappings.
+    """Return the values of a configuration with the named sections as mutable mappings.
 
-    ``hall`` and ``servers`` both describe the servers of a rack, so they are opened together.
+    ``hall`` and ``servers`` both describe the servers of a rack, so both become mappings together.
     """
     opened = sections | ({"hall", "servers"} if sections & {"hall", "servers"} else set())
     values = dict(config)
@@ -125,7 +125,7 @@ def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
 
 
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Name and merged values of a preset or file, those that it extends included."""
+    """Return label and values of a preset or file, merged with the preset that it extends."""
     if isinstance(source, str) and source in preset_names():
         return _read_preset(source)
     try:
@@ -160,7 +160,7 @@ def _parse_preset(name: str, label: str) -> dict[str, Any]:
 
 
 def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Values on top of the preset that they extend, if they name one."""
+    """Merge values with the preset that they name under ``extends``, if any."""
     base = values.pop("extends", None)
     if base is None:
         return values
@@ -175,20 +175,20 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _replace_excluded(merged: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Unset inherited fields whose place is taken by fields of ``values``."""
-    given = {
+    """Unset inherited fields that fields of ``values`` exclude, see ``_REPLACES``."""
+    assigned = {
         f"{section}.{name}": value
         for section in ("hall", "servers")
         if isinstance(fields := values.get(section), dict)
         for name, value in fields.items()
     }
     for new, replaced in _REPLACES.items():
-        if given.get(new) in (None, {}):
+        if assigned.get(new) in (None, {}):
             continue
         for path, unset in replaced.items():
             section, _, name = path.partition(".")
             fields = merged.setdefault(section, {})
-            if path not in given and isinstance(fields, dict):
+            if path not in assigned and isinstance(fields, dict):
                 fields[name] = unset
 
 
@@ -203,7 +203,7 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parse(text: str, label: str, kind: str = "YAML") -> dict[str, Any]:
-    """Sections of a YAML or JSON text."""
+    """Parse a YAML or JSON text into a mapping of sections."""
     try:
         values = load_json(text) if kind == "JSON" else load_yaml(text)
     except ValueError as error:
@@ -218,11 +218,11 @@ def apply_override(values: dict[str, Any], override: str) -> None:
     """Apply an assignment to plain values, without validating them.
 
     Args:
-        values: sections, which are changed.
-        override: ``a.b=c``; ``c`` is read as YAML.
+        values: Mapping of sections, which is changed in place.
+        override: Assignment ``a.b=c``; ``c`` is parsed as YAML.
 
     Raises:
-        ConfigError: no assignment, or an assignment to something other than a section.
+        ConfigError: The text is not an assignment, or its path is not in a section.
     """
     path, sign, text = override.partition("=")
     if not sign:
@@ -237,7 +237,7 @@ def apply_override(values: dict[str, Any], override: str) -> None:
 
 
 def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> None:
-    """Put a value at a dotted path; messages quote ``override``."""
+    """Assign a value to a dotted path; error messages quote ``override``."""
     *sections, last = path.strip().split(".")
     if not all([*sections, last]):
         raise ConfigError(f"override {shortened(override)}: valid is section.key=value")

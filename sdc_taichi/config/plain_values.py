@@ -1,8 +1,8 @@
-"""Plain values of YAML and JSON texts: mappings, lists, texts, numbers, booleans and nothing.
+"""Parsers of YAML and JSON texts into mappings, lists, texts, numbers, booleans and None.
 
-Both formats allow more than a configuration needs. Here a key may be given only once, and numbers
-are decimal: YAML 1.1 also reads ``1:30`` as 90 and ``017`` as 15. The merge key ``<<`` of YAML is
-read as an ordinary key.
+The parsers are stricter than the formats. A key may appear only once in a mapping. All numbers are
+decimal, whereas YAML 1.1 reads ``1:30`` as 90 and ``017`` as 15. The merge key ``<<`` of YAML is an
+ordinary key.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from sdc_taichi.errors import shortened
 from sdc_taichi.number_text import parse_number, parse_whole
 
 _WHOLE = re.compile(r"[-+]?[0-9]+$")
-# A subset of YAML 1.1, whose writer puts every other text that YAML 1.1 takes for a number in
-# quotes.
+# This pattern is a subset of the numbers of YAML 1.1. Writers of YAML 1.1 quote every text that
+# looks like one of its numbers, so the subset reads their output correctly.
 _NUMBER = re.compile(
     r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
 )
 
 
 def load_yaml(text: str) -> Any:
-    """The plain values that a YAML text holds.
+    """Parse a YAML text into plain values.
 
     Raises:
-        ValueError: not valid, or a key given twice; says what is wrong.
+        ValueError: The text is not valid YAML, or a mapping has a key twice.
     """
     try:
         return yaml.load(text, _Loader)
@@ -37,11 +37,11 @@ def load_yaml(text: str) -> Any:
 
 
 def load_json(text: str) -> Any:
-    """The plain values that a JSON text holds.
+    """Parse a JSON text into plain values.
 
     Raises:
-        ValueError: not valid, a key given twice, or a number that is not finite; says what is
-            wrong.
+        ValueError: The text is not valid JSON, a mapping has a key twice, or a number is not
+            finite.
     """
     return json.loads(
         text,
@@ -53,9 +53,9 @@ def load_json(text: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads plain values, and refuses a mapping that gives a key twice.
+    """YAML loader of plain values that rejects mappings with duplicate keys.
 
-    Of such a key, YAML would drop the first value.
+    PyYAML itself would silently ignore all but the last value of a duplicate key.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -69,7 +69,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Leave a mapping as it is, even where a key has the tag of merge keys."""
+        """Do nothing, so that merge keys stay ordinary keys."""
 
 
 _Loader.yaml_implicit_resolvers = {

@@ -1,7 +1,7 @@
 """Schema of one data center: a validated, frozen tree of sections for YAML, overrides and Python.
 
-A preset names one model per stage (see docs/presets.md); no stage asks which preset it is in.
-Units are part of every field name. An unknown key is an error that suggests the nearest valid one.
+A preset selects one model per stage (see docs/presets.md); the models do not depend on the preset.
+Field names include their units. An unknown key is an error that suggests the nearest valid one.
 """
 
 from __future__ import annotations
@@ -42,32 +42,33 @@ from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
 
 MOST_RACK_W = 200e3
-"""Highest nameplate of the servers of a rack that air cools, in W: its air, 8 m3/s at a rise of 20
-K, would blow through its door of 1.3 m2 at 6 m/s. The densest on the market take about 100 kW."""
+"""Largest nameplate power of an air-cooled rack, in W. At a temperature rise of 20 K, its airflow
+of 8 m3/s would pass a door of 1.3 m2 at 6 m/s. The densest racks on the market have about
+100 kW."""
 
 
 class BatteryConfig(Section):
     """Battery: model, capacity and limits (C/L/C of Kazhamiaka, Rosenberg and Keshav 2019)."""
 
     model: Annotated[str, NameIn(BATTERIES)] = "clc"
-    """How energy stored, drawn and delivered follow from a command."""
+    """Battery model: energy stored, drawn and delivered as functions of a command."""
     capacity_kwh: Annotated[float, Field(ge=0, le=1e8)] | None = None
-    """Capacity, in kWh, up to 1e8, five times the largest plant under construction (19 GWh, Abu
-    Dhabi 2025); None sizes it to ``hours_of_design_load``."""
+    """Battery capacity, in kWh, up to 1e8, five times the largest plant under construction (19 GWh,
+    Abu Dhabi 2025); None sizes the battery by ``hours_of_design_load``."""
     hours_of_design_load: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Facility power at the design point that the sized capacity lasts for, in h, 0..1,000;
-    batteries made to last longest, of iron and air, last for 100 h."""
+    """Time for which a full battery could supply the facility at its design power, in h, 0..1,000;
+    iron-air batteries, which discharge most slowly, reach 100 h."""
     initial_soc: Share = 0.0
     """State of charge after a reset, 0..1."""
     charge_efficiency: WorkingShare = 0.97
-    """Energy stored per energy drawn from the bus, 0.01..1."""
+    """Energy stored divided by energy drawn from the bus, 0.01..1."""
     discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.04
-    """Energy drawn from the store per energy delivered, 1..100: from no loss to an efficiency
-    of 1 %."""
+    """Energy taken from the store divided by energy delivered to the bus, 1..100: from no loss to
+    an efficiency of 1 %."""
     charge_limit_c_rate: CRate = 0.5
-    """Largest rate into the store, in capacities per hour (1/h)."""
+    """Largest rate at which the stored energy rises, in capacities per hour (1/h)."""
     discharge_limit_c_rate: CRate = 1.0
-    """Largest rate out of the store, in capacities per hour (1/h)."""
+    """Largest rate at which the stored energy falls, in capacities per hour (1/h)."""
     upper_u_h: Annotated[float, Field(ge=-100, le=0)] = -0.04
     """Slope u of the upper limit of the stored energy, u P + v capacity, against the charge power
     P, in h, -100..0."""
@@ -75,7 +76,7 @@ class BatteryConfig(Section):
     """Share v of the capacity in the upper limit of the stored energy, 0..1."""
     lower_u_h: Annotated[float, Field(ge=0, le=100)] = 0.01
     """Slope u of the lower limit of the stored energy, u P + v capacity, against the discharge
-    power P, in h, 0..100; it is the time for which the remaining energy would last."""
+    power P, in h, 0..100."""
     lower_v: Share = 0.0
     """Share v of the capacity in the lower limit of the stored energy, 0..1."""
 
@@ -90,7 +91,7 @@ class WorkloadConfig(Section):
     """Delay-tolerant work: its share, queue and deadline (1 task = 1 % of capacity for a step)."""
 
     model: Annotated[str, NameIn(WORK_MODELS)] = "fluid"
-    """Whether work is a continuous quantity, or whole tasks as in the released SustainDC."""
+    """Work model: a continuous quantity, or whole tasks as in the released SustainDC."""
     trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
@@ -100,12 +101,13 @@ class WorkloadConfig(Section):
     max_utilisation: WorkingShare = 1.0
     """Highest utilisation of the data center, 0.01..1."""
     queue_limit_h: Hours | None = 2.5
-    """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
+    """Queue capacity, in hours of work of the whole data center at full utilisation; None means an
+    unlimited queue."""
     deadline_h: Hours | None = 24.0
-    """Time after which work that waits is due, in h; None is no deadline."""
+    """Time after which waiting work is due, in h; None means no deadline."""
     age_horizon_h: Hours = 24.0
-    """Age up to which the age of waiting work is exact, in h; older work counts as one step older
-    than this."""
+    """Largest age of waiting work that is tracked, in h; all older work counts as one step older
+    than this age."""
 
     @model_validator(mode="after")
     def _deadline_within_horizon(self) -> Self:
@@ -118,23 +120,24 @@ class WorkloadConfig(Section):
 
 
 class SiteConfig(Section):
-    """Where the data center stands and when its year starts."""
+    """Location of the data center, first day of a run, and input files."""
 
     location: Name = "NY"
-    """Name of the site, which gives weather and carbon intensity (see ``sdc-taichi data list``)."""
+    """Name of the site, which selects weather and carbon intensity (see ``sdc-taichi data
+    list``)."""
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
     seed: Seed = 10
-    """Seed of the synthetic year; imported data ignore it."""
+    """Seed of the synthetic year, which does not affect imported data."""
     weather_file: FileName | None = None
-    """EPW file in place of the weather of ``location``; None is no file."""
+    """EPW file that replaces the weather of ``location``; None uses no file."""
     carbon_file: FileName | None = None
-    """CSV file in place of the carbon intensity of ``location``; None is no file."""
+    """CSV file that replaces the carbon intensity of ``location``; None uses no file."""
     workload_file: FileName | None = None
-    """CSV file in place of the workload trace; None is no file."""
+    """CSV file that replaces the workload trace; None uses no file."""
     carbon_pairing: Literal["local", "utc_rows"] = "local"
-    """Alignment in time of carbon intensity and weather: both in local standard time, or rows in
-    UTC beside local rows as in the released SustainDC."""
+    """Time alignment of carbon intensity and weather: both in local standard time, or carbon
+    intensity in UTC combined with weather in local time, as in the released SustainDC."""
 
     @field_validator("start", mode="before")
     @classmethod
@@ -144,12 +147,13 @@ class SiteConfig(Section):
 
 
 class SimulationConfig(Section):
-    """Time step, and whether servers and room have thermal mass."""
+    """Time step and thermal model."""
 
     thermal: Literal["quasi_steady", "transient"] = "quasi_steady"
-    """Whether temperatures belong to the present load, or remember earlier steps."""
+    """Thermal model: ``quasi_steady`` temperatures depend on the present step alone; ``transient``
+    temperatures include the thermal mass of servers and room."""
     substep_s: Annotated[float, Field(ge=5, le=120)] = 60.0
-    """Longest substep of transient temperatures, in s."""
+    """Longest substep of the transient thermal model, in s."""
     steps_per_hour: Annotated[int, Field(ge=1, le=60)] = 4
     """Number of steps in an hour."""
 
@@ -165,7 +169,7 @@ class SimulationConfig(Section):
 
 
 class DataCenterConfig(Section):
-    """Everything that defines one data center."""
+    """Complete configuration of one data center."""
 
     name: Name = "dc"
     """Name of the data center in results and messages."""
@@ -186,11 +190,11 @@ class DataCenterConfig(Section):
     workload: WorkloadConfig = WorkloadConfig()
     """Work of the servers and its queue."""
     protection: ProtectionConfig = ProtectionConfig()
-    """How servers protect themselves from hot inlets."""
+    """Protection of servers from hot air."""
     events: EventsConfig = EventsConfig()
-    """Failures and weather that a run meets."""
+    """Failures and weather events of a run."""
     site: SiteConfig = SiteConfig()
-    """Place, files of measured inputs, and first day of a run."""
+    """Location, input files, and first day of a run."""
     simulation: SimulationConfig = SimulationConfig()
     """Time step and thermal mass."""
 
@@ -307,7 +311,7 @@ class DataCenterConfig(Section):
         return self
 
     def _check_airflow(self) -> None:
-        """Check that servers move air at their coldest inlets, where the airflow ratio is least."""
+        """Raise an error if the airflow of servers is not positive at their coldest inlets."""
         racks, groups = self.hall.racks, self._listed_groups()
         lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
         approach_k = np.zeros(racks)
@@ -325,7 +329,7 @@ class DataCenterConfig(Section):
 
     @property
     def server_heat_capacity_kj_per_k(self) -> float:
-        """Heat capacity of one server, mean over the hall, in kJ/K."""
+        """Mean heat capacity of one server of the hall, in kJ/K."""
         configured = self.servers.heat_capacity_kj_per_k
         return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
 
@@ -336,7 +340,7 @@ class DataCenterConfig(Section):
         return ROOM_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
 
     def _mean_server_w(self) -> float:
-        """Power of a server at full load without its fans, mean over the hall, in W."""
+        """Return the mean power of the hall's servers at full load, without fans, in W."""
         listed = self._listed_groups()
         if listed is None:
             count = np.asarray(self.hall.servers_per_rack, dtype=np.float64)
@@ -346,7 +350,7 @@ class DataCenterConfig(Section):
         return sum(g.count * g.full_w for g in groups) / sum(g.count for g in groups)
 
     def rack_nameplate_w(self) -> np.ndarray:
-        """Power at full load of the servers of every rack, without their fans, in W, (R,)."""
+        """Return the power of every rack's servers at full load, without fans, in W, (R,)."""
         groups = self._listed_groups()
         if groups is None:
             full_w = np.array([full for full, _ in self.servers.power_pairs])
@@ -359,21 +363,21 @@ class DataCenterConfig(Section):
         return np.asarray(rack_w * (self.hall.capacity_mw * 1e6 / rack_w.sum()))
 
     def _given_groups(self) -> dict[str, tuple[ServerGroup, ...]]:
-        """Server groups of rack types and of single racks, by the path of their field."""
+        """Return all configured server groups by the path of their field."""
         types = {f"hall.rack_types.{k}": v.servers for k, v in self.hall.rack_types.items()}
         racks = {f"servers.groups rack {i}": r for i, r in enumerate(self.servers.groups or ())}
         return types | racks
 
     def _listed_groups(self) -> tuple[tuple[ServerGroup, ...], ...] | None:
-        """Server groups of every rack, or one entry for all racks; None without any."""
+        """Return the server groups of every rack, or one entry for all racks, or None."""
         types = self.hall.rack_types
         return tuple(types[n].servers for n in self.hall.rack_type_names()) or self.servers.groups
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
-        """Server groups of every rack, with ``hall.capacity_mw`` applied to the counts.
+        """Return the server groups of every rack, with counts scaled to ``hall.capacity_mw``.
 
         Raises:
-            ConfigError: the capacity leaves racks without servers.
+            ConfigError: The capacity leaves racks without servers.
         """
         racks, listed = self.hall.racks, self._listed_groups()
         if listed is not None:
@@ -410,17 +414,17 @@ class DataCenterConfig(Section):
         )
 
     def to_yaml(self) -> str:
-        """YAML text that ``load_config`` reads back equal."""
+        """Return YAML text that ``load_config`` reads back as an equal configuration."""
         values = self.model_dump(mode="json")
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
         if all(map(str.isprintable, text.split("\n"))):
             return text
-        # Escaped control characters do nothing in a terminal, and read back equal.
+        # Escape control characters, which could otherwise affect a terminal that shows the text.
         return yaml.safe_dump(values, sort_keys=False)
 
 
 def _check_rack(where: str, rack: tuple[ServerGroup, ...]) -> None:
-    """Check that the servers of a rack fit into it, and that none is overloaded."""
+    """Raise an error if the servers of a rack do not fit into it, or if one is overloaded."""
     if not rack:
         raise ValueError(f"{where} is empty; valid is at least one group")
     height_u = sum(g.count * g.height_u for g in rack if g.height_u is not None)

@@ -1,7 +1,7 @@
 """Reader of the SustainDC ``dc_config.json`` format.
 
-The schema below has the keys of the format, and its errors name them; bounds that are narrower
-follow from the configuration that a file becomes.
+The schema below has the keys of the format, and its error messages name these keys. The resulting
+configuration checks narrower bounds.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from sdc_taichi.config.fields import Count, Section, check_one_per_rack, validat
 from sdc_taichi.config.hall_schema import RackCount
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
-"""Any number."""
+"""Any number with an absolute value of at most 1e12."""
 Efficiency = Annotated[float, Field(gt=0, le=1e12)]
-"""Number above 0 that others are divided by."""
+"""Positive number, which serves as a divisor."""
 Pair = tuple[Number, Number]
 """Two numbers."""
 
@@ -34,9 +34,9 @@ class _Hall(Section):
 
 
 class _Hvac(Section):
-    """Air, CRAC units, chiller, tower and pumps; the CHILLER_COP values are checked, but not used.
+    """Air, CRAC units, chiller, tower and pumps.
 
-    The released code does not use them either.
+    The CHILLER_COP values are checked but not used, as in the released code.
     """
 
     C_AIR: Number
@@ -58,7 +58,7 @@ class _Hvac(Section):
 
 
 class _Servers(Section):
-    """Curves and power of the servers; HP_PROLIANT is checked, but not used, as in their code."""
+    """Curves and power of servers; HP_PROLIANT is checked but not used, as in the released code."""
 
     CPU_POWER_RATIO_LB: Pair
     CPU_POWER_RATIO_UB: Pair
@@ -73,7 +73,7 @@ class _Servers(Section):
 
 
 class _File(Section):
-    """A file of the format."""
+    """Complete file of the SustainDC format."""
 
     data_center_configuration: _Hall
     hvac_configuration: _Hvac
@@ -93,19 +93,19 @@ class _File(Section):
 
 
 def is_of_format(values: Mapping[str, Any]) -> bool:
-    """Whether the content of a JSON file is of the SustainDC format."""
+    """Return True if the content of a JSON file has the SustainDC format."""
     return "data_center_configuration" in values
 
 
 def read(values: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Translate a SustainDC file into values of the schema on top of preset ``sustaindc``.
+    """Translate a SustainDC file into configuration values, to be merged into preset ``sustaindc``.
 
     Args:
-        values: content of the JSON file.
-        label: path of the file, for messages and the name of the data center.
+        values: Content of the JSON file.
+        label: Path of the file, for error messages and for the name of the data center.
 
     Raises:
-        ConfigError: for a missing or unknown key, a wrong type, or a wrong length.
+        ConfigError: A key is missing or unknown, or a value has the wrong type or length.
     """
     hall, hvac, servers = validated(_File, values, label).model_dump(mode="json").values()
     chilled_w, condenser_w = (

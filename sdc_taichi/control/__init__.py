@@ -1,7 +1,7 @@
-"""Controllers by name and by rules, and the views that they decide on.
+"""Controllers, and the views of data centers from which they compute actions.
 
 A controller turns a view of the data centers into actions and has no other access to them.
-Learning algorithms and physics never live here.
+This package contains no learning algorithms and no physics.
 """
 
 from sdc_taichi.control.registry import (

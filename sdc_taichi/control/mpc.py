@@ -1,10 +1,10 @@
 """Model-predictive control: plan the coming hours before each step, and apply the first command.
 
-A plan covers work, setpoint and battery over a horizon. It uses what every controller can see:
-forecasts of weather and carbon intensity, prices, and the work of the next step; later work is
-expected to resemble the work of the same time on past days. Energies come from a ``FacilityMap``,
-tables of the simulator at constant load and setpoint, so plans do not foresee transients, events
-or racks that throttle or switch off.
+A plan covers work, setpoint and battery up to a horizon. It uses only the information of a view:
+forecasts of weather and carbon intensity, prices, and the work of the next step. The forecast of
+later work is based on the work at the same time of past days. Energies come from a ``FacilityMap``,
+tables of the simulator at constant load and setpoint, so plans ignore transients, events, and racks
+that throttle or switch off. B is the number of data centers and H the number of steps of a plan.
 """
 
 from __future__ import annotations
@@ -34,28 +34,29 @@ CARBON = Objective(carbon=1.0)
 SETPOINT_STEP_K = 0.5
 """Largest spacing of the candidate setpoints, in K."""
 KNOWN_DAYS = 7
-"""Number of past days whose mean work is the expected work."""
+"""Number of past days whose mean work is the forecast of work."""
 FADES_IN_H = 3.0
-"""Time in which the deviation of the present work from the mean decays to 1/e, in h."""
+"""Time constant with which the deviation of the present work from that mean decays, in h."""
 PEAKS = 8
-"""Number of candidate peak powers of the month if there is a demand charge."""
+"""Number of candidates for the month's peak power, which plans compare if there is a demand
+charge."""
 _NAME = re.compile(r"mpc-(?P<hours>[^:]*)h(?::(?P<objective>.*))?")
 
 
 def is_mpc(name: str) -> bool:
-    """Whether a controller name denotes a ``ModelPredictive``."""
+    """Return True if a controller name stands for a ``ModelPredictive`` controller."""
     return name.startswith("mpc")
 
 
 def model_predictive(name: str, agents: tuple[Agent, ...]) -> ModelPredictive:
-    """Model-predictive controller of a name such as ``mpc-24h`` or ``mpc-72h:cost``.
+    """Make a model-predictive controller from a name such as ``mpc-24h`` or ``mpc-72h:cost``.
 
     Args:
-        name: horizon in hours, and the objective if it is not carbon.
-        agents: agents whose commands it gives.
+        name: Name with the horizon in hours, and with the objective unless it is carbon.
+        agents: Agents whose commands the controller gives.
 
     Raises:
-        ConfigError: a horizon or an objective that is not valid.
+        ConfigError: The horizon or the objective is not valid.
     """
     match = _NAME.fullmatch(name)
     try:
@@ -76,15 +77,16 @@ class ModelPredictive:
     """Controller that plans the coming hours before every step.
 
     Args:
-        hours: horizon, in h.
-        objective: quantity that the plan minimises, without water.
-        agents: agents whose commands it gives; it assumes neutral commands of the others.
+        hours: Horizon, in h.
+        objective: Quantity that the plan minimises; it must not include water.
+        agents: Agents whose commands the controller gives; it assumes neutral commands of the
+            others.
 
     Attributes:
-        commands: fields of ``Actions`` that it gives.
+        commands: Fields of ``Actions`` that the controller gives.
 
     Raises:
-        ConfigError: a horizon that is out of bounds, or an objective with water.
+        ConfigError: The horizon is out of bounds, or the objective includes water.
     """
 
     def __init__(
@@ -115,7 +117,7 @@ class ModelPredictive:
         self._actions = Actions()
 
     def act(self, view: View) -> Actions:
-        """Commands of its agents; a repeated call with the same view returns the same commands."""
+        """Return the commands of the agents; the same view gives the same commands again."""
         if view is not self._view:
             if self._planners is None or not self._planners.suit(view):
                 self._planners = _Planners(view, self._agents)
@@ -156,7 +158,7 @@ class ModelPredictive:
         return Actions(**commands)
 
     def _month_peak_kw(self, view: View) -> F64:
-        """Highest power so far in the month of the next step, in kW, (B,)."""
+        """Return the highest power so far in the month of the next step, in kW, (B,)."""
         step = view.state.step
         if self._bill is None:
             self._bill = no_demand(view.state.start, view.fleet.steps_per_hour)
@@ -166,7 +168,7 @@ class ModelPredictive:
 
 
 class _Planners:
-    """Planners and tables of a fleet, valid while data centers and weather series stay the same."""
+    """Planners and tables of a fleet, valid for one set of data centers and weather series."""
 
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.plans import QueuePlanner, StorePlanner
@@ -183,7 +185,7 @@ class _Planners:
         )
         allowed = self.facility.at_own_nodes(self.facility.allowed)
         self.is_limited = np.array([not nodes.all() for nodes in allowed])[self.facility.which]
-        """Whether an inlet limit rules out some setpoint in some weather, (B,)."""
+        """True where an inlet limit excludes at least one setpoint in some weather, (B,)."""
         self.queue = QueuePlanner(
             view.fleet,
             self.facility,
@@ -195,7 +197,7 @@ class _Planners:
             self.store = StorePlanner(view.fleet, view.sizing, view.step_h)
 
     def suit(self, view: View) -> bool:
-        """Whether the planners were made for the data centers and the weather of a view."""
+        """Return True if the planners are valid for the data centers and weather of a view."""
         return (
             view.sizing is self._sizing
             and view.drivers.outdoor_c is self._drivers.outdoor_c
@@ -204,14 +206,14 @@ class _Planners:
 
 
 def expected_demand(view: View, index: I64) -> F64:
-    """Expected arriving work as a share of capacity, (B, H).
+    """Forecast the arriving work as a share of capacity, (B, H).
 
-    The work of the next step is known. Later work is the mean of the same time on the past
-    ``KNOWN_DAYS`` days plus the decaying deviation of the present work from that mean.
+    The work of the next step is known. The forecast of later work is the mean at the same time of
+    the past ``KNOWN_DAYS`` days, plus the decaying deviation of the present work from its mean.
 
     Args:
-        view: the situation before the step.
-        index: coming steps, counted from the beginning of the year, (B, H).
+        view: View before the step.
+        index: Coming steps, counted from the beginning of the year, (B, H).
     """
     demand, per_hour = view.drivers.demand, view.fleet.steps_per_hour
     day, lead = 24 * per_hour, np.arange(index.shape[1])
@@ -225,7 +227,7 @@ def expected_demand(view: View, index: I64) -> F64:
 
 
 def _cooling_command(view: View, planners: _Planners, weather: Weather, work: QueuePlan) -> F64:
-    """Command (B,) towards the setpoint of least energy at the load and weather of the step."""
+    """Return the command towards the setpoint of minimum energy in the next step, (B,)."""
     now = slice(0, 1)
     best_c = planners.facility.best_setpoint_c(
         (work.executed_tasks / 100.0)[:, None],
@@ -233,7 +235,7 @@ def _cooling_command(view: View, planners: _Planners, weather: Weather, work: Qu
         weather.wet_bulb_c[:, now],
     )[:, 0]
     target_c = np.minimum(best_c, view.setpoint_c + RAMP_K)
-    # A setpoint that falls because of hot inlets is not limited to the ramp.
+    # Where inlets have a limit, the setpoint may fall faster than the ramp.
     gradual_c = np.maximum(target_c, view.setpoint_c - RAMP_K)
     target_c = np.where(planners.is_limited, target_c, gradual_c)
     return setpoint_command(target_c, view)

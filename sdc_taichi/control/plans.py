@@ -1,4 +1,8 @@
-"""Plans of queues and batteries by dynamic programming (kernels in ``kernels/planning.py``)."""
+"""Plans for queues and batteries by dynamic programming (kernels in ``kernels/planning.py``).
+
+B is the number of data centers, H the number of steps of a plan, and C the number of candidate
+commands of the next step.
+"""
 
 from __future__ import annotations
 
@@ -29,22 +33,25 @@ from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
 from sdc_taichi.types import F64, I64, BatteryResult, Work
 
 MOST_AT_ONCE = 256
-"""Data centers per kernel call, which bounds the memory of its work space."""
+"""Largest number of data centers per kernel call; it limits the memory of the work space."""
 
 
 def first_commands() -> F64:
-    """Candidate commands of the next step, (C,), smallest first; ties go to the first."""
+    """Return candidate commands of the next step, (C,), in ascending order of absolute value.
+
+    Of commands with equal cost, plans choose the first.
+    """
     steps = np.concatenate([[0.01, 0.02, 0.04, 0.06, 0.08], np.arange(1, 11) / 10.0])
     return np.concatenate([[0.0], np.stack([-steps, steps], axis=1).ravel()])
 
 
 class PlanningKernel:
-    """A planning kernel with its work space.
+    """Planning kernel with its work space.
 
     Args:
-        kernel: the kernel.
-        arguments: spec of its arguments.
-        levels: number of levels of the state (queue or stored energy) between steps.
+        kernel: Taichi kernel.
+        arguments: Specification of the arguments of the kernel.
+        levels: Number of grid levels of the planned state (queue or stored energy).
     """
 
     def __init__(self, kernel: Any, arguments: Mapping[str, Argument], levels: int) -> None:
@@ -70,14 +77,14 @@ class PlanningKernel:
         """Run the kernel for all data centers.
 
         Args:
-            size: number of data centers, B.
-            horizon: number of coming steps, H.
-            of_dc: rows of the argument ``of_dc`` by name, (B,) each.
-            commands: commands of steps after the first.
-            peaks: number of candidate peak powers of the month.
-            table: argument ``table`` of the kernel, if it has one.
-            facility_kwh: energy of the facility in each step, (B, H); None computes it.
-            of_each: other arguments by name, with the data centers first.
+            size: Number of data centers, B.
+            horizon: Number of coming steps, H.
+            of_dc: Rows of the argument ``of_dc`` by name, each (B,).
+            commands: Candidate commands of steps after the first.
+            peaks: Number of candidates for the month's peak power.
+            table: Argument ``table`` of the kernel, if the kernel has one.
+            facility_kwh: Energy of the facility in each step, kWh, (B, H); None computes it.
+            of_each: Other arguments by name, with the data centers along the first axis.
 
         Returns:
             Index of the best first command, (B,), and ``facility_kwh``.
@@ -112,33 +119,35 @@ class PlanningKernel:
 
 
 QUEUE_LEVELS, STORE_LEVELS = 51, 41
-"""Levels of the queue and of the stored energy in plans."""
+"""Numbers of grid levels of the queue and of the stored energy in plans."""
 COMMANDS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
-"""Candidate commands of steps after the first; ties go to the first."""
+"""Candidate commands of steps after the first. Of commands with equal cost, plans choose the
+first."""
 
 
 class Weather(NamedTuple):
     """Forecast weather of the coming steps."""
 
     outdoor_c: F64
-    """Dry bulb, in C, (B, H)."""
+    """Outdoor dry-bulb temperature, in C, (B, H)."""
     wet_bulb_c: F64
-    """Wet bulb, in C, (B, H)."""
+    """Outdoor wet-bulb temperature, in C, (B, H)."""
 
 
 class EnergyCost(NamedTuple):
     """Cost of energy in the coming steps, in the unit of the objective."""
 
     weight: F64
-    """Cost of a kWh in each step, (B, H)."""
+    """Cost per kWh in each step, (B, H)."""
     peak_kwh: F64
-    """Highest energy of a step that the month's demand charge already covers, in kWh, (B,)."""
+    """Largest energy of a step so far in the month, which sets its demand charge, in kWh, (B,)."""
     peak_cost: F64
-    """Cost of each kWh of a step above ``peak_kwh``, (B,); 0 without a demand charge."""
+    """Additional cost per kWh by which a step exceeds ``peak_kwh``, (B,); 0 without demand
+    charge."""
 
 
 class QueuePlan(NamedTuple):
-    """Load command of the next step, and the plan's work and energy."""
+    """Load command of the next step, with the work and energy of the plan."""
 
     load: F64
     """Load command, (B,)."""
@@ -149,13 +158,13 @@ class QueuePlan(NamedTuple):
 
 
 class QueuePlanner:
-    """Plans the work of B data centers.
+    """Planner of the work of B data centers.
 
     Args:
-        fleet: the data centers.
-        facility: energy of their steps by load, weather and setpoint.
-        moves_work: whether plans may move work; else they give the energy of neutral commands.
-        moves_setpoint: whether each step has its best setpoint; else the present setpoint holds.
+        fleet: Data centers.
+        facility: Energy of a step by load, weather and setpoint.
+        moves_work: True if plans may move work; False computes the energy of neutral commands.
+        moves_setpoint: True if each step has its best setpoint; False keeps the present setpoint.
     """
 
     def __init__(
@@ -186,15 +195,15 @@ class QueuePlanner:
         *,
         peaks: int,
     ) -> QueuePlan:
-        """Plan the coming steps.
+        """Plan the work of the coming steps.
 
         Args:
-            queue: accumulated work in the queue by the step of its arrival, oldest first, (B, L).
-            demand: arriving work as a share of capacity, the next step first, (B, H).
-            weather: weather of the coming steps.
-            cost: cost of energy.
-            setpoint_c: present setpoint, in C, (B,).
-            peaks: number of candidate peak powers of the month; 1 without a demand charge.
+            queue: Cumulative queued work by step of arrival, in tasks, oldest step first, (B, L).
+            demand: Arriving work as a share of capacity, (B, H).
+            weather: Weather of the coming steps.
+            cost: Cost of energy in the coming steps.
+            setpoint_c: Present setpoint, C, (B,).
+            peaks: Number of candidates for the month's peak power; 1 without a demand charge.
         """
         size, horizon = demand.shape
         waiting, due = queue[:, -1], _due_by(queue, self._due_steps, horizon)
@@ -230,7 +239,7 @@ class QueuePlanner:
         )
 
     def _first_step(self, demand: F64, waiting: F64, due: F64) -> Work:
-        """Work of the next step under each candidate command, (B, C)."""
+        """Compute the work of the next step for each candidate command, (B, C)."""
         shape = len(demand), len(self._first)
         demand, command, waiting, due = (
             np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)
@@ -242,13 +251,13 @@ class QueuePlanner:
     def _coming(
         self, demand: F64, weather: Weather, weight: F64, waiting: F64, due: F64
     ) -> dict[str, F64]:
-        """Inputs of each coming step by the names of ``STEP_ROWS``, (B, H) each."""
+        """Return the inputs of all coming steps by the names of ``STEP_ROWS``, each (B, H)."""
         arrived = demand * TASKS_PER_STEP
         flexible = arrived * self._share
         capacity = np.broadcast_to(self._cap * TASKS_PER_STEP, demand.shape)
         most_drained, most_due = np.full(demand.shape, UNLIMITED_TASKS), capacity
         if self._model == "tasks":
-            # This model moves whole tasks, and inflexible work runs even beyond the capacity.
+            # The model ``tasks`` moves whole tasks, and runs inflexible work beyond the capacity.
             flexible = np.floor(flexible)
             arrived = np.ceil(arrived * (1.0 - self._share)) + flexible
             capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
@@ -272,7 +281,7 @@ class QueuePlanner:
         }
 
     def _not_due(self, held_back: F64) -> F64:
-        """Most work of the coming steps that may wait after each of them, (B, H)."""
+        """Return the largest work of the coming steps that may wait after each step, (B, H)."""
         total = np.cumsum(held_back, axis=1)
         horizon = held_back.shape[1]
         before = np.arange(horizon) - np.minimum(self._due_steps, horizon)[:, None].astype(np.int64)
@@ -280,29 +289,29 @@ class QueuePlanner:
         return total - np.where(before >= 0, gone, 0.0)
 
     def _place_of(self, setpoint_c: F64) -> F64:
-        """Fractional index of setpoints between the nodes of the map, (B,)."""
+        """Return the fractional index of setpoints on the grid of the facility map, (B,)."""
         low, share = self._facility.places_of_setpoints(setpoint_c[:, None])
         return (low + share)[:, 0]
 
 
 def _kwh(facility: FacilityMap) -> F64:
-    """Energy by map, weather, setpoint and utilisation; a single setpoint is repeated."""
+    """Return energy by map, weather, setpoint and utilisation, with at least two setpoints."""
     kwh = np.ascontiguousarray(np.moveaxis(facility.facility_kwh, 4, 3))
     return kwh if kwh.shape[3] > 1 else np.repeat(kwh, 2, axis=3)
 
 
 def _kwh_of_best_setpoint(facility: FacilityMap) -> F64:
-    """Energy at the best setpoint, repeated since the kernel interpolates between two setpoints."""
+    """Return energy at the best setpoint, twice: the kernel interpolates between two setpoints."""
     return np.stack([facility.least_kwh] * 2, axis=3)
 
 
 def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
-    """Work in the queue that is due by each coming step, in tasks, (B, H).
+    """Return the queued work that is due by each coming step, in tasks, (B, H).
 
     Args:
-        queue: accumulated work in the queue by the step of its arrival, oldest first, (B, L).
-        due_after_steps: age at which work is due, in steps, inf for never, (B,).
-        horizon: number of coming steps.
+        queue: Cumulative queued work by step of arrival, in tasks, oldest step first, (B, L).
+        due_after_steps: Age at which work is due, in steps, (B,); inf means no deadline.
+        horizon: Number of coming steps, H.
     """
     length = queue.shape[1]
     first = length - np.minimum(due_after_steps, length + horizon).astype(np.int64)
@@ -312,16 +321,16 @@ def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
 
 
 _AMPLE_KW, _SLIGHT_KW = 1e9, 1e-3
-"""Facility powers, in kW, that never limit and that always limit the discharge of a battery."""
+"""Facility powers, in kW, of which the first never and the second always limits a discharge."""
 
 
 class StorePlanner:
-    """Plans the batteries of B data centers.
+    """Planner of the batteries of B data centers.
 
     Args:
-        fleet: the data centers.
-        sizing: sizes of their devices.
-        step_h: length of a step, in h.
+        fleet: Data centers.
+        sizing: Sizes of the devices of the data centers.
+        step_h: Length of a step, h.
     """
 
     def __init__(self, fleet: Fleet, sizing: Sizing, step_h: float) -> None:
@@ -350,13 +359,13 @@ class StorePlanner:
         )
 
     def plan(self, stored_kwh: F64, facility_kwh: F64, cost: EnergyCost, *, peaks: int) -> F64:
-        """Battery command of the next step, (B,).
+        """Return the battery command of the next step, (B,).
 
         Args:
-            stored_kwh: energy in the store, in kWh, (B,).
-            facility_kwh: energy of the facility in the coming steps, in kWh, (B, H).
-            cost: cost of energy.
-            peaks: number of candidate peak powers of the month; 1 without a demand charge.
+            stored_kwh: Stored energy, kWh, (B,).
+            facility_kwh: Energy of the facility in the coming steps, kWh, (B, H).
+            cost: Cost of energy in the coming steps.
+            peaks: Number of candidates for the month's peak power; 1 without a demand charge.
         """
         size, horizon = facility_kwh.shape
         load_kw = facility_kwh[:, :1] / self._step_h
@@ -388,7 +397,7 @@ class StorePlanner:
     def _step(
         self, stored_kwh: F64, command: F64 | float, load_kw: F64 | float, limit: F64 | None = None
     ) -> BatteryResult:
-        """One step of each battery from several levels or under several commands, (B, n)."""
+        """Step each battery from several stored energies or with several commands, (B, n)."""
         return self._model.step(
             stored_kwh,
             command,
@@ -403,5 +412,5 @@ class StorePlanner:
 
 
 def _ratio(part: F64, whole: F64) -> F64:
-    """``part`` divided by ``whole``, (B,); 1 where ``whole`` is 0."""
+    """Return ``part`` / ``whole``, (B,), and 1 where ``whole`` is 0."""
     return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0)

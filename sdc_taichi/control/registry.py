@@ -1,4 +1,4 @@
-"""Controllers by name, for the command line, for environments and for benchmarks."""
+"""Registry that makes controllers by name, for command line, environments and benchmarks."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import function_named, import_path, register_function
 
 CONTROLLABLE: tuple[Agent, ...] = AGENTS
-"""Parts of a controller spec, named like the commands of ``Actions`` that they give."""
+"""Valid parts of a controller spec such as ``load=NAME``, named like commands of ``Actions``."""
 ControllerMaker = Callable[[str, Fleet, tuple[str, ...]], Controller]
-"""Function that makes a controller from the text after the colon of its name, the data centers, and
-the parts of a spec that name it."""
+"""Function that makes a controller. Its arguments are the text after the colon of the controller's
+name, the data centers, and the parts of the spec that use this name."""
 
 
 class _NamedController(NamedTuple):
-    """A built-in controller."""
+    """Built-in controller: its constructor and the agents for which it is valid."""
 
     make: Callable[[], Controller]
     """Function that makes the controller."""
     parts: tuple[str, ...]
-    """Parts of a spec that may name it, of ``CONTROLLABLE``."""
+    """Parts of a spec (from ``CONTROLLABLE``) for which the controller is valid."""
 
 
 _CONTROLLERS: dict[str, _NamedController] = {
@@ -61,18 +61,18 @@ _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
 _POLICY = "policy:FOLDER"
 _registered: dict[str, Any] = {"policy": "sdc_taichi.learning.controller:policy_controller"}
-"""Makers, or their import paths, by the part of a name before its colon; import paths are resolved
-on first use."""
+"""Registered makers, or their import paths, by the part of a controller name before the colon.
+Import paths are resolved on first use."""
 _BUILT_IN = (*_CONTROLLERS, "constant", "policy")
 _SUGGESTION = " (did you mean {!r}?)"
 
 
 def controller_names() -> tuple[str, ...]:
-    """Valid names.
+    """Return the valid controller names.
 
     ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``mpc-24h`` for any
     horizon and objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a training
-    run or a policy. An import path ``module:name`` is valid too.
+    run or a policy. An import path ``module:name`` is also valid.
     """
     added = (name for name in _registered if name not in _BUILT_IN)
     return (*_CONTROLLERS, _CONSTANT, _MPC, _POLICY, *added)
@@ -82,13 +82,13 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
     """Register a controller under a name that every controller option accepts.
 
     Args:
-        name: an identifier; a spec ``name:TEXT`` passes TEXT to the maker.
-        maker: a function that returns the controller, called with the text after the colon, the
-            fleet, and the parts of the spec (load, cooling, battery) that name it; a controller
-            class without constructor arguments; or the import path ``module:name`` of either.
+        name: Identifier; a spec ``name:TEXT`` passes TEXT to the maker.
+        maker: Function that returns the controller, class without constructor arguments, or import
+            path ``module:name`` of either. A function is called with the text after the colon, the
+            fleet, and the parts of the spec (load, cooling, battery) that use the name.
 
     Raises:
-        ConfigError: the name is taken, or ``maker`` is neither a function nor a class.
+        ConfigError: The name is taken, or ``maker`` is neither a function nor a class.
     """
     if isinstance(maker, str):
         if not (isinstance(name, str) and name.isidentifier()) or name in _BUILT_IN:
@@ -101,38 +101,40 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
 
 
 def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = True) -> Controller:
-    """A controller by name, one per agent, or a copy of a controller.
+    """Make a controller from a spec, or copy a controller.
 
     Args:
-        spec: a name; ``agent=name`` parts joined by commas, such as ``load=greedy-ci,cooling=g36``,
-            where all other agents stay idle; or a controller.
-        fleet: the data centers to control.
-        imports: whether import paths ``module:name`` are valid. They are not in files, which may
-            come from an untrusted source.
+        spec: Name of a controller; ``agent=name`` parts joined by commas, such as
+            ``load=greedy-ci,cooling=g36``, where all other agents stay idle; or a controller.
+        fleet: Data centers to control.
+        imports: True if import paths ``module:name`` are valid. Specs in files must not import
+            code, because files may come from an untrusted source.
 
     Raises:
-        ConfigError: an unknown agent or name, a controller that does not act on the agent, a
-            constant setpoint that is out of range, or an object that is no controller.
-        SdcError: a policy that cannot be read or does not fit the data centers.
+        ConfigError: An agent or name is unknown, a controller does not act on its agent, a constant
+            setpoint is out of range, or an object is not a controller.
+        SdcError: A policy cannot be read or does not fit the data centers.
     """
     if not isinstance(spec, str):
         return _copy(spec)
     named = parts_of(spec)
     if not named:
         return _make(spec.strip(), fleet, None, imports)
-    chosen: dict[str, Controller] = {}
+    controllers: dict[str, Controller] = {}
     for name in dict.fromkeys(named.values()):
         # Parts with the same name share one controller, so that a plan covers them together.
         parts = tuple(part for part in CONTROLLABLE if named.get(part) == name)
-        chosen |= dict.fromkeys(parts, _make(name, fleet, parts, imports))
-    return PerAgent(*(chosen.get(part, Idle()) for part in CONTROLLABLE))
+        controllers |= dict.fromkeys(parts, _make(name, fleet, parts, imports))
+    return PerAgent(*(controllers.get(part, Idle()) for part in CONTROLLABLE))
 
 
 def parts_of(spec: str) -> dict[str, str]:
-    """Names by agent in a spec such as ``load=greedy-ci,cooling=g36``; empty for a plain name.
+    """Return the controller names by agent in a spec such as ``load=greedy-ci,cooling=g36``.
+
+    The result is empty for a plain name.
 
     Raises:
-        ConfigError: an unknown agent, or one that is given twice.
+        ConfigError: An agent is unknown or appears twice.
     """
     first, sign, _ = spec.partition("=")
     if not sign or ":" in first:
@@ -152,7 +154,7 @@ def parts_of(spec: str) -> dict[str, str]:
 
 
 def controller_text(spec: str | Controller) -> str:
-    """Text that names a controller: its spec, or the import path of the class of an object."""
+    """Return the spec of a controller, or the import path of its class if it is an object."""
     return spec if isinstance(spec, str) else import_path(type(spec))
 
 
@@ -160,11 +162,11 @@ def check_controller(given: Any, what: str = "") -> Controller:
     """Check that an object is a controller, and return it.
 
     Args:
-        given: the object.
-        what: beginning of error messages, such as the option with the controller.
+        given: Object to check.
+        what: Beginning of error messages, such as the name of the option with the controller.
 
     Raises:
-        ConfigError: the object lacks a method, is a class, or names an unknown command.
+        ConfigError: The object lacks a method, is a class, or names an unknown command.
     """
     place = f"{what}: " if what else ""
     if isinstance(given, type):
@@ -188,7 +190,7 @@ def check_controller(given: Any, what: str = "") -> Controller:
 
 
 def _copy(given: Any) -> Controller:
-    """Deep copy of a controller, since controllers may have a memory."""
+    """Return a deep copy of a controller, because controllers may have internal state."""
     controller = check_controller(given, "controller")
     try:
         return deepcopy(controller)
@@ -200,7 +202,7 @@ def _copy(given: Any) -> Controller:
 
 
 def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool) -> Controller:
-    """Make a controller by name for the ``parts`` of a spec that name it; None for a plain name."""
+    """Make a controller by name, for the ``parts`` of a spec; None stands for a plain name."""
     if is_mpc(name):
         return model_predictive(name, parts or CONTROLLABLE)
     kind, colon, text = name.partition(":")
@@ -221,14 +223,14 @@ def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: boo
 
 
 def _first_missing(parts: tuple[Agent, ...] | None, valid: Sequence[str]) -> Agent | None:
-    """The first of ``parts`` that is not in ``valid``, if there is one."""
+    """Return the first of ``parts`` that is not in ``valid``, or None."""
     return next((part for part in parts or () if part not in valid), None)
 
 
 def _made_by_maker(
     name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool
 ) -> Controller:
-    """Make a controller by a registered maker, or by the maker whose import path is ``name``."""
+    """Make a controller with a registered maker, or with one whose import path is ``name``."""
     kind, _, text = name.partition(":")
     maker = _registered.get(kind)
     if maker is None:

@@ -1,8 +1,8 @@
-"""Rule-based controllers of a whole fleet.
+"""Rule-based controllers of a fleet of B data centers.
 
-A controller has ``reset(seed)`` and ``act(view) -> Actions``. Commands that it does not give are
-neutral: work is neither deferred nor drained, the setpoint holds or follows its schedule, and the
-battery idles.
+A controller has ``reset(seed)`` and ``act(view) -> Actions``. Commands that a controller does not
+give are neutral: work is neither deferred nor drained, the setpoint stays constant or follows its
+schedule, and the battery idles.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
-"""Interval of trim and respond, in min."""
+"""Interval at which trim and respond changes the setpoint, in min."""
 REQUEST_INLET_C = 27.0
-"""Highest recommended inlet temperature (ASHRAE TC 9.9); a rack above it requests cooling."""
+"""Inlet temperature above which a rack requests cooling, in C: the highest one that ASHRAE TC 9.9
+recommends."""
 COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "load": ("load", "placement"),
     "cooling": ("cooling", "fan", "placement"),
@@ -49,10 +50,10 @@ class Controller(Protocol):
         """
 
     def act(self, view: View) -> Actions:
-        """Commands of the next step.
+        """Return the commands of the next step.
 
         Args:
-            view: state and forecasts of B data centers before the step.
+            view: State and forecasts of B data centers before the step.
 
         Returns:
             Commands, each (B,) or one value for all data centers; see ``Actions``.
@@ -60,10 +61,10 @@ class Controller(Protocol):
 
 
 class _WithoutMemory:
-    """Controllers whose commands depend on the view alone."""
+    """Base class of controllers whose commands depend on the view alone."""
 
     def reset(self, seed: int | I64) -> None:
-        """Do nothing: no memory."""
+        """Do nothing, because the controller has no memory."""
 
 
 class Idle(_WithoutMemory):
@@ -73,7 +74,7 @@ class Idle(_WithoutMemory):
     """Fields of ``Actions`` that it gives."""
 
     def act(self, view: View) -> Actions:
-        """Neutral commands."""
+        """Return neutral commands."""
         return Actions()
 
 
@@ -95,7 +96,7 @@ class Random:
         self._block = -1
 
     def act(self, view: View) -> Actions:
-        """Commands for work, setpoint and battery, each -1, 0 or 1."""
+        """Return random commands for work, setpoint and battery, each -1, 0 or 1."""
         block, at = divmod(view.state.step, _DRAWN_STEPS)
         if len(self._streams) != view.size or block < self._block:
             self._streams = [np.random.Generator(np.random.PCG64(s)) for s in self._seeds(view)]
@@ -147,10 +148,10 @@ class TrimAndRespond(_WithoutMemory):
 
 
 class FixedSetpoint(_WithoutMemory):
-    """Constant setpoint, reached with the first command.
+    """Controller that sets a constant setpoint with its first command.
 
     Args:
-        setpoint_c: temperature, C, or the name of a limit: ``low`` or ``high``.
+        setpoint_c: Setpoint, C, or ``low`` or ``high`` for the lowest or the highest setpoint.
     """
 
     commands = ("cooling",)
@@ -171,12 +172,12 @@ class FixedSetpoint(_WithoutMemory):
 
 
 class Lookahead(_WithoutMemory):
-    """Battery that charges and discharges by the forecast carbon intensity of a coming window.
+    """Battery controller that compares the carbon intensity with its forecast for a time window.
 
-    It charges at full power if the present intensity is in the lowest quarter of the window and
-    discharges if it is in the highest quarter. It idles otherwise, and if the ratio of the lowest
-    to the highest intensity exceeds the round-trip efficiency. Carbon Explorer times storage by
-    forecasts in the same way (Acun et al., ASPLOS 2023).
+    The battery charges at full power if the present intensity is in the lowest quarter of the
+    window, and discharges if it is in the highest quarter. Otherwise the battery idles. It also
+    idles if the ratio of the lowest to the highest intensity exceeds the round-trip efficiency.
+    Carbon Explorer schedules storage by forecasts in the same way (Acun et al., ASPLOS 2023).
 
     Args:
         hours: length of the window, in h.
@@ -189,17 +190,17 @@ class Lookahead(_WithoutMemory):
         self._hours = hours
 
     def act(self, view: View) -> Actions:
-        """Battery command alone."""
+        """Return battery commands only."""
         ci = view.forecast(self._hours).ci_g_per_kwh
         pays = ci.max(axis=1) * view.limits.battery_round_trip > ci.min(axis=1)
         return Actions(battery=np.where(pays, quartile_command(ci), 0.0))
 
 
 class GreedyCarbon(_WithoutMemory):
-    """Work and battery by the present carbon intensity relative to the mean of a coming window.
+    """Controller of work and battery that compares the carbon intensity with its forecast mean.
 
-    Above the mean, work is deferred and the battery discharges; below it, the queue drains and the
-    battery charges.
+    If the present intensity is above the mean of the coming window, work is deferred and the
+    battery discharges. If it is below the mean, the queue drains and the battery charges.
 
     Args:
         hours: length of the window, in h.
@@ -212,7 +213,7 @@ class GreedyCarbon(_WithoutMemory):
         self._hours = hours
 
     def act(self, view: View) -> Actions:
-        """Commands for work and battery."""
+        """Return commands for work and battery."""
         ci = view.forecast(self._hours).ci_g_per_kwh
         mean, now = ci.mean(axis=1), ci[:, 0]
         # The computed mean of a constant window can differ from its value in the last bit.
@@ -221,20 +222,21 @@ class GreedyCarbon(_WithoutMemory):
 
 
 class PerAgent:
-    """One controller for each of load, cooling and battery.
+    """Combination of one controller each for load, cooling and battery.
 
-    A controller that has several of these parts acts once per step.
+    A controller that is used for several of them acts only once per step.
 
     Args:
-        load: gives the load command, and the placement of work if it has one.
-        cooling: gives the setpoint command, and fan speeds and placement if it has them.
-        battery: gives the battery command.
+        load: Controller of the load command, and of the placement of work if it gives one.
+        cooling: Controller of the setpoint command, and of fan speeds and placement if it gives
+            them.
+        battery: Controller of the battery command.
 
     Attributes:
-        commands: fields of ``Actions`` that the parts give.
+        commands: Fields of ``Actions`` that the controllers give.
 
     Raises:
-        ConfigError: the load and the cooling controller both place work.
+        ConfigError: The load controller and the cooling controller both place work.
     """
 
     def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
@@ -251,12 +253,12 @@ class PerAgent:
         self.commands = tuple(self._giver)
 
     def reset(self, seed: int | I64) -> None:
-        """Reset each with the same seed."""
+        """Reset all controllers with the same seed."""
         for controller in self._controllers:
             controller.reset(seed)
 
     def act(self, view: View) -> Actions:
-        """Combine the commands of the parts."""
+        """Return the combined commands of all controllers."""
         actions = {id(controller): controller.act(view) for controller in self._controllers}
         return Actions(
             **{name: getattr(actions[id(giver)], name) for name, giver in self._giver.items()}
@@ -264,11 +266,11 @@ class PerAgent:
 
 
 def commands_of(controller: Controller) -> tuple[str, ...]:
-    """Fields of ``Actions`` that a controller gives; all others stay neutral.
+    """Return the fields of ``Actions`` that a controller gives; all others stay neutral.
 
     Args:
-        controller: a controller; without an attribute ``commands`` it gives load, cooling and
-            battery.
+        controller: Controller; without an attribute ``commands``, load, cooling and battery are
+            returned.
     """
     return tuple(getattr(controller, "commands", AGENTS))
 
@@ -284,7 +286,7 @@ def trim_and_respond(
     max_respond_k: float = -0.6,
     ignored: int = 2,
 ) -> F64:
-    """One slot of trim and respond (ASHRAE Guideline 36-2021, 5.1.14) on a supply setpoint.
+    """Apply one interval of trim and respond (ASHRAE Guideline 36-2021, 5.1.14) to a setpoint.
 
     The setpoint moves by ``trim_k``, and with more than ``ignored`` requests R also by
     max(max_respond_k, respond_k*(R - ignored)), within its range.
@@ -308,30 +310,30 @@ def trim_and_respond(
 
 
 def slots_in_step(step: int, step_h: float) -> int:
-    """Number of slots of trim and respond that end within a step.
+    """Return the number of intervals of trim and respond that end within a step.
 
     Args:
-        step: the step, from 0.
-        step_h: length of a step, in h.
+        step: Number of the step, from 0.
+        step_h: Length of a step, h.
     """
     minutes = round(step_h * 60.0)
     return int((step + 1) * minutes // SLOT_MIN - step * minutes // SLOT_MIN)
 
 
 def setpoint_command(target_c: F64, view: View) -> F64:
-    """Cooling command, in steps, (B,), that moves the setpoint to ``target_c``, in C, (B,)."""
+    """Return the command, in setpoint steps, that moves the setpoint to ``target_c``, (B,)."""
     command = (target_c - view.setpoint_c) / view.limits.setpoint_step_k
     return avoid_repeats(command, view.cooling_last)
 
 
 def quartile_command(ci_g_per_kwh: F64) -> F64:
-    """Battery command by the rank of the present carbon intensity within a window.
+    """Return a battery command by the rank of the present carbon intensity within a window.
 
     A value is in the lowest quarter of n values if fewer than n/4 of them are lower. A value in
     both the lowest and the highest quarter, as in a constant window, gives 0.
 
     Args:
-        ci_g_per_kwh: carbon intensity of the window in g CO2e/kWh, the present value first, (B, n).
+        ci_g_per_kwh: Carbon intensity in the window, g CO2e/kWh, present value first, (B, n).
 
     Returns:
         1 (charge) in the lowest quarter, -1 (discharge) in the highest, else 0, (B,).

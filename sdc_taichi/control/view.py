@@ -1,10 +1,9 @@
-"""Views of data centers for controllers, and forecasts with errors made of random walks.
+"""Views of data centers for controllers, and forecasts whose errors are random walks.
 
-The error of the forecast that is issued at time t for t + h is ``s (W(t + h) - W(t))`` with a
-standard deviation s at 24 h and a random walk W of unit variance per 24 h. It is zero for the
-present, grows with the square root of the lead, and a later forecast of the same hour differs from
-an earlier one by what the walk has done in between. Environments and controllers read the same
-walks: a walk depends on the key of its data center and on the step alone.
+A forecast issued at time t for time t + h has the error ``s (W(t + h) - W(t))``, with a random walk
+W of unit variance per 24 h and the standard deviation s of the error at 24 h. The error is zero for
+the present and grows with the square root of the lead h. Environments and controllers use the same
+walks, which depend only on the key of the data center and on the step.
 """
 
 from __future__ import annotations
@@ -28,31 +27,32 @@ from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
 
 MOST_CI_SHARE = 10.0
-"""Largest error of carbon intensity, ten times its value: no forecast is that poor."""
+"""Largest valid standard deviation of carbon intensity errors, divided by the true value."""
 MOST_TEMPERATURE_K = 40.0
-"""Largest error of temperatures, in K: the largest departure from the climate on record is 39 K."""
+"""Largest valid standard deviation of temperature errors, in K; the largest recorded deviation from
+the climate is 39 K."""
 CI_WALK, TEMPERATURE_WALK = 0, 1
-"""Numbers of the walks of carbon intensity and of temperatures."""
+"""Indices of the random walks of carbon intensity and of temperatures."""
 _FIELD_OF_NAME = {"ci": "ci_share", "temperature": "temperature_k"}
-"""Fields of ``ForecastError`` by the names that its text has for them."""
+"""Fields of ``ForecastError`` by their names in its text form."""
 _DRAWN_STEPS = 128
-"""Steps of the random walks that are drawn at once."""
+"""Number of steps of the random walks that are drawn at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class ForecastError:
-    """Errors of forecasts: standard deviations at a lead of 24 h. Zero is perfect foresight.
+    """Standard deviations of forecast errors at a lead of 24 h; zero means perfect foresight.
 
     Raises:
-        ConfigError: a value that is no number or out of bounds.
+        ConfigError: A value is not a number or out of bounds.
     """
 
     ci_share: Annotated[float, Field(ge=0, le=MOST_CI_SHARE)] = 0.0
-    """Standard deviation of the carbon intensity at 24 h, as a share of its true value, 0..10;
-    forecasts are cut at zero."""
+    """Standard deviation of the error of carbon intensity at 24 h, as a share of the true value,
+    0..10; negative forecasts are set to zero."""
     temperature_k: Annotated[float, Field(ge=0, le=MOST_TEMPERATURE_K)] = 0.0
-    """Standard deviation of dry bulb and wet bulb at 24 h, in K, 0..40. Both err alike, so that the
-    wet bulb stays below the dry bulb."""
+    """Standard deviation of the error of outdoor temperatures at 24 h, in K, 0..40. Dry bulb and
+    wet bulb have the same error, so the wet bulb stays below the dry bulb."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -65,13 +65,14 @@ class ForecastError:
 
     @classmethod
     def parse(cls, text: str) -> ForecastError:
-        """Forecast errors from their text, such as ``ci=0.1,temperature=1``.
+        """Parse forecast errors from a text such as ``ci=0.1,temperature=1``.
 
         Args:
-            text: ``ci``, a share, and ``temperature``, in K, each with its value or left out.
+            text: Assignments of ``ci``, as a share, and ``temperature``, in K; either may be
+                missing.
 
         Raises:
-            ConfigError: another name, one that is given twice, or a value that is not valid.
+            ConfigError: A name is unknown or appears twice, or a value is not valid.
         """
         values: dict[str, float] = {}
         for part in text.split(","):
@@ -100,11 +101,11 @@ PERFECT = ForecastError()
 
 
 class RandomWalks:
-    """Two random walks for each data center, of unit variance per 24 h, from reset on.
+    """Two random walks for each data center, of unit variance per 24 h, that start at reset.
 
     Args:
-        keys: seed of each data center, (B,).
-        step_h: time step, in h.
+        keys: Seed of the walks of each data center, (B,).
+        step_h: Length of a step, h.
     """
 
     def __init__(self, keys: Sequence[int] | I64, step_h: float) -> None:
@@ -114,17 +115,17 @@ class RandomWalks:
         self._walk: F64 = np.zeros((2, 1, len(keys)))
 
     def increments(self, which: int, step: int, leads: I64) -> F64:
-        """Increments of a walk between ``step`` and each lead, (k, B).
+        """Return the increments of a walk between ``step`` and each lead, (k, B).
 
-        What lies before ``step`` is dropped.
+        This call discards the walk before ``step``.
 
         Args:
             which: ``CI_WALK`` or ``TEMPERATURE_WALK``.
-            step: steps since reset.
-            leads: leads in steps, (k,).
+            step: Number of steps since reset.
+            leads: Leads, in steps, (k,).
 
         Raises:
-            RuntimeStateError: ``step`` lies before one that was asked for already.
+            RuntimeStateError: ``step`` is before the step of an earlier call.
         """
         self._extend(step, int(leads.max()))
         now = step - self._first
@@ -147,11 +148,12 @@ class RandomWalks:
 
 
 def walk_keys(seeds: I64, names: Sequence[str]) -> I64:
-    """Seeds of the walks of a run, (B,), other than those of its events and controllers.
+    """Return seeds of the random walks of a run, (B,), independent of events and controllers.
 
     Args:
-        seeds: seed of each data center, (B,).
-        names: names of the data centers, B, so that data centers of one seed have other errors.
+        seeds: Seed of each data center, (B,).
+        names: Names of the B data centers; data centers with equal seeds but different names have
+            different errors.
     """
     drawn = [
         np.random.SeedSequence([int(seed), zlib.crc32(name.encode())]).generate_state(1, np.uint64)
@@ -171,14 +173,14 @@ class Limits:
     setpoint_step_k: F64
     """Change of the setpoint by a cooling command of 1, in K, (B,)."""
     battery_round_trip: F64
-    """Energy that the battery delivers per energy drawn to charge it, 0..1, (B,)."""
+    """Battery round-trip efficiency: energy delivered divided by energy drawn, 0..1, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Weather, carbon intensity and price of coming steps as they are forecast.
+    """Forecast of weather, carbon intensity and price for n coming steps.
 
-    Column 0 is the step to come, which is known exactly, as prices are for all steps.
+    Column 0 is the next step, which is known exactly. Prices are exact for all steps.
     """
 
     drivers: Drivers
@@ -186,9 +188,9 @@ class Forecast:
     index: I64
     """Coming steps, counted from the beginning of the year, (B, n)."""
     ci_error: F64 | None = None
-    """Error of the carbon intensity as a share of its true value, (B, n); None is exact."""
+    """Error of the carbon intensity as a share of its true value, (B, n); None means no error."""
     temperature_error_k: F64 | None = None
-    """Error of both temperatures, in K, (B, n); None is exact."""
+    """Error of dry bulb and wet bulb, in K, (B, n); None means no error."""
 
     @property
     def ci_g_per_kwh(self) -> F64:
@@ -204,12 +206,12 @@ class Forecast:
 
     @property
     def outdoor_c(self) -> F64:
-        """Outdoor dry bulb, in C, (B, n)."""
+        """Outdoor dry-bulb temperature, in C, (B, n)."""
         return self._temperature_c(self.drivers.outdoor_c)
 
     @property
     def wet_bulb_c(self) -> F64:
-        """Outdoor wet bulb, in C, (B, n)."""
+        """Outdoor wet-bulb temperature, in C, (B, n)."""
         return self._temperature_c(self.drivers.wet_bulb_c)
 
     def _temperature_c(self, series: FleetSeries) -> F64:
@@ -222,11 +224,11 @@ class View:
     """Data that a controller may see before a step of a fleet of B data centers."""
 
     last: StepResult | None
-    """Result of the step before; None before the first step."""
+    """Result of the previous step; None before the first step."""
     state: State
-    """State before the step to come."""
+    """State before the next step."""
     drivers: Drivers
-    """Inputs of all steps; those of later steps are the future, without errors of forecasts."""
+    """True inputs of all steps, including future ones; ``forecast`` returns them with errors."""
     fleet: Fleet
     """The data centers, with their configs."""
     sizing: Sizing
@@ -238,25 +240,25 @@ class View:
     precision: Precision
     """Floating-point precision of the hall kernels: ``f32`` or ``f64``."""
     forecast_error: ForecastError = PERFECT
-    """How forecasts err."""
+    """Standard deviations of the forecast errors."""
     walks: RandomWalks | None = None
-    """Walks that the errors are made of, shared by the views of an episode; None for perfect
+    """Random walks of the forecast errors, shared by all views of an episode; None for perfect
     forecasts."""
 
     @property
     def now(self) -> Exogenous:
-        """Inputs of the step to come, each (B,)."""
+        """Inputs of the next step, each (B,)."""
         return self.drivers.at(self.state.step)
 
     def forecast(self, hours: float) -> Forecast:
-        """Inputs of the coming hours, exact unless those of the run or environment err.
+        """Return a forecast of the coming hours, with the errors of ``forecast_error``.
 
         Args:
-            hours: length of the forecast, rounded to whole steps.
+            hours: Length of the forecast, h, rounded to whole steps.
 
         Raises:
-            ConfigError: the forecast is shorter than a step, or longer than a year.
-            RuntimeStateError: forecasts err, and those of a later step have been asked for.
+            ConfigError: The forecast is shorter than a step, or longer than a year.
+            RuntimeStateError: Forecasts have errors, and one of a later step was requested before.
         """
         if not self.step_h / 2 < hours <= HOURS_PER_YEAR:
             raise ConfigError(
@@ -269,18 +271,18 @@ class View:
         return Forecast(self.drivers, first[:, None] + leads, ci_error, error_k)
 
     def _error(self, walk: int, deviation: float, leads: I64) -> F64 | None:
-        """Errors of a forecast at each lead, (B, n); None without any."""
+        """Return the errors of a forecast at each lead, (B, n), or None if there are none."""
         if self.walks is None or deviation == 0.0:
             return None
         walked = self.walks.increments(walk, self.state.step, leads)
-        # In the order of series, on which the last bit of a mean over the steps depends.
+        # Use the memory order of input series, because it affects the rounding errors of means.
         return float(deviation) * np.ascontiguousarray(walked.T)
 
     @property
     def setpoint_c(self) -> F64:
         """Setpoint of the first CRAC unit of each data center, in C, (B,).
 
-        The controllers of this package move all units alike.
+        The controllers of this package give all units the same command.
         """
         return _first_of_units(self.state.setpoint_c, self.fleet)
 
@@ -296,7 +298,7 @@ class View:
 
 
 def limits_of(fleet: Fleet) -> Limits:
-    """Limits of setpoint and battery from the configs of a fleet."""
+    """Return the limits of setpoint and battery from the configurations of a fleet."""
     return Limits(
         setpoint_low_c=fleet.values("hvac.setpoint.min_c"),
         setpoint_high_c=fleet.values("hvac.setpoint.max_c"),
@@ -309,16 +311,16 @@ def limits_of(fleet: Fleet) -> Limits:
 def view_maker(
     sim: Simulator, forecast_error: ForecastError = PERFECT, keys: I64 | None = None
 ) -> Callable[[StepResult | None], View]:
-    """Function that makes the view before each step of an episode.
+    """Return a function that makes the view before each step of an episode.
 
     Args:
-        sim: a simulator that has been reset.
-        forecast_error: how forecasts err.
-        keys: seeds of the errors, (B,); None takes them from the seeds that the simulator was reset
-            with, and from the names of its data centers.
+        sim: Simulator that has been reset.
+        forecast_error: Standard deviations of the forecast errors.
+        keys: Seeds of the errors, (B,); None computes them from the seeds of the simulator's reset
+            and the names of its data centers.
 
     Returns:
-        Function of the last step's result, or of None before the first step.
+        Function from the previous step's result, or None before the first step, to a view.
     """
     step_h = sim.step_h
     limits, sizing = limits_of(sim.fleet), sim.sizing
@@ -345,7 +347,7 @@ def view_maker(
 
 
 def mean_setpoint_c(view: View) -> F64:
-    """Mean setpoint of the CRAC units of each data center, in C, (B,)."""
+    """Return the mean setpoint of the CRAC units of each data center, in C, (B,)."""
     fleet = view.fleet
     return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_offsets))
 

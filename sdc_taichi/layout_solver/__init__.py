@@ -1,5 +1,5 @@
-"""Air flow in a hall solved on a grid from its layout, for ``sdc-taichi hall solve``.
+"""Solver for the airflow in a hall on a grid built from its layout (``sdc-taichi hall solve``).
 
-The result is a recirculation matrix that a configuration can name; the simulator never runs it.
-Nothing here advances time or knows of a plant.
+The result is a recirculation matrix, to which a configuration can refer. The simulator never runs
+this solver, and no function here advances time or uses a plant.
 """

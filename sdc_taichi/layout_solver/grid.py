@@ -1,4 +1,7 @@
-"""Grid of a hall for the layout solver: cells whose faces lie on racks, aisles and containment."""
+"""Grid of a hall for the layout solver, with cell faces aligned to racks, aisles and containment.
+
+R is the number of racks, N the number of air cells, and X x Y x Z the size of the grid.
+"""
 
 from __future__ import annotations
 
@@ -14,53 +17,54 @@ from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
 from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000
-"""Most cells of a grid, solids included: about 2 GB on two threads."""
+"""Largest number of cells of a grid, solid cells included; it needs about 2 GB on two threads."""
 CELL_RANGE_M = (0.05, 2.0)
-"""Least and largest length of a cell, in m."""
+"""Smallest and largest valid cell length, in m."""
 DEFAULT_CELL_M = 0.3
-"""Length of a cell unless another is asked for, in m."""
+"""Default cell length, in m."""
 LEAST_LEAK = 1e-3
-"""Smallest share of the free area that containment leaves open: for gaps, and because the flow must
-balance even where racks draw more air than the tiles of their closed aisle supply."""
+"""Smallest share of the free area that containment leaves open. It represents gaps, and lets the
+flow balance even where racks draw more air than the floor tiles of their aisle supply."""
 
 _EDGE = (0.25, 0.5)
-"""Lengths of the cells at the edges of racks, where potential flow is singular, in cells."""
+"""Lengths of the two cells next to a rack edge, divided by the usual cell length. They are short
+because potential flow is singular at edges."""
 _CELL_HEIGHT = 0.5
-"""Height of a cell divided by its length: halls are flat, and the air of aisles is stratified."""
+"""Height of a cell divided by its length. Cells are flat because temperatures vary with height."""
 _WEST, _FRONT, _FLOOR, _EAST, _BACK, _CEILING = range(6)
 
 
 @dataclass(frozen=True, slots=True)
 class RackFaces:
-    """Cell faces at one side of R racks, rack by rack."""
+    """Cell faces at the inlet side or the exhaust side of R racks, listed rack by rack."""
 
     face_offsets: I32
-    """First face of each rack, and the number of faces, (R + 1,)."""
+    """Index of the first face of each rack, and the number of faces, (R + 1,)."""
     cell: I32
-    """Cell of air before each face, (faces,)."""
+    """Index of the air cell adjacent to each face, (faces,)."""
     m3s: F64
     """Airflow through each face, in m3/s, (faces,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """N cells of air.
+    """Grid of N air cells with six faces each, and the airflows through the hall's boundaries.
 
-    Arrays over cells have a last entry for no cell, where areas are 1 and all else is 0. The faces
-    of a cell are those to the west (smaller x), front (smaller y), floor, east, back and ceiling.
+    Arrays over cells have a dummy last entry, where areas are 1 and all other values 0. The faces
+    of a cell are in the order west (smaller x), front (smaller y), floor, east, back, ceiling.
     """
 
     widths_m: tuple[F64, F64, F64]
-    """Widths of the cells along the rows, across them, and from the floor up, in m, those of solid
-    cells included."""
+    """Widths of the cells along the rows, across the rows, and upwards, in m, for air and solid
+    cells."""
     beyond: I32
-    """Cell beyond each face, N if none, (N + 1, 6)."""
+    """Index of the neighbouring cell at each face, N if there is none, (N + 1, 6)."""
     conductance_m: F64
-    """Free area of each face over the distance of the centres, in m, (N + 1, 6)."""
+    """Free area of each face divided by the distance of the cell centres, in m, (N + 1, 6)."""
     boundary_m3s: F64
-    """Flow that leaves the hall through each face, in m3/s, (N + 1, 6)."""
+    """Flow that leaves the air of the hall through each face, in m3/s, (N + 1, 6)."""
     area_m2: F64
-    """Area of the faces across each axis, in m2, (N + 1, 3)."""
+    """Area of the faces normal to each axis, in m2, (N + 1, 3)."""
     fronts: RackFaces
     """Inlet faces of the racks."""
     backs: RackFaces
@@ -70,32 +74,33 @@ class Grid:
     supply_m3s: F64
     """Supply air into each cell above floor tiles, in m3/s, (tile cells,)."""
     return_cell: I32
-    """Cells before returns, (return cells,)."""
+    """Cells adjacent to return air openings, (return cells,)."""
     return_m3s: F64
-    """Return air out of each cell before returns, in m3/s, (return cells,)."""
+    """Return air that leaves through each of the return cells, in m3/s, (return cells,)."""
 
     @property
     def cells(self) -> int:
-        """Number of cells that hold air."""
+        """Number of air cells, N."""
         return len(self.beyond) - 1
 
 
 def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: float) -> Grid:
-    """Cut the hall into cells and place racks, tiles, returns and containment.
+    """Divide the hall into cells and place racks, tiles, returns and containment.
 
-    Every measure of the layout is a whole number of cells, at most ``cell_m`` long and half as
-    high. Floor tiles fill the cold aisles between the row ends. The racks that face an aisle
-    determine its supply air by their airflow, and so the air that ceiling returns take above it;
-    returns in the end walls take air evenly above the height of the racks.
+    Every dimension of the layout is a whole number of cells, which are at most ``cell_m`` long and
+    half as high. Floor tiles fill the cold aisles between the row ends. The supply air of a cold
+    aisle is proportional to the airflow of the racks that face it, and the return air above a hot
+    aisle to that of the racks adjacent to it. Returns in the end walls are above the height of the
+    racks and have a uniform air speed.
 
     Args:
-        hall: Shape of the hall.
+        hall: Configuration of the hall.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
-        supply_m3s: Airflow of all floor tiles together, m3/s.
-        cell_m: Longest cell, m.
+        supply_m3s: Total airflow of the floor tiles, m3/s.
+        cell_m: Largest cell length, m.
 
     Raises:
-        ConfigError: a cell length out of range, or more cells than memory is made for.
+        ConfigError: The cell length is out of range, or the grid has too many cells.
     """
     plan = floor_plan(hall)
     cuts = _cut_hall(hall, plan, cell_m)
@@ -110,34 +115,35 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
 
 @dataclass(frozen=True, slots=True)
 class _Cuts:
-    """A hall cut into X x Y x Z cells, those of the racks solid."""
+    """Division of a hall into X x Y x Z cells, of which those inside racks are solid."""
 
     widths_m: tuple[F64, F64, F64]
-    """Widths of the cells along the rows, across them, and from the floor up, in m."""
+    """Widths of the cells along the rows, across the rows, and upwards, in m."""
     place_of_x: I32
-    """Place in its row of the racks at each x, (X,); -1 or racks per row in the end margins."""
+    """Place in the row of the racks at each x index, (X,); -1 or the number of racks per row in the
+    margins."""
     strip_of_y: I32
-    """Strip at each y, aisles (even) and rows (odd) in turn, (Y,)."""
+    """Number of the strip at each y index, (Y,); aisles have even and rows odd numbers."""
     low: npt.NDArray[np.bool_]
-    """Whether each z is below the top of the racks, (Z,)."""
+    """True for z indices below the top of the racks, (Z,)."""
     beside: npt.NDArray[np.bool_]
-    """Whether each x lies between the row ends, (X,)."""
+    """True for x indices between the row ends, (X,)."""
     number: I32
-    """Number of each cell of air, and the count of them for solid cells, (X, Y, Z)."""
+    """Index of each air cell, and the number of air cells for solid cells, (X, Y, Z)."""
     cells: int
-    """Number of cells of air."""
+    """Number of air cells."""
 
     @property
     def aisle_of_y(self) -> I32:
-        """Aisle at each y, (Y,); -1 in rows. Odd aisles are cold."""
+        """Number of the aisle at each y index, (Y,); -1 in rows. Odd aisles are cold."""
         return np.where(self.strip_of_y % 2 == 0, self.strip_of_y // 2, -1)
 
 
 def _cut_hall(hall: HallConfig, plan: FloorPlan, cell_m: float) -> _Cuts:
-    """Cut the measures of a hall into cells and number those of air.
+    """Divide a hall into cells and number the air cells.
 
     Raises:
-        ConfigError: a cell length out of range, or more cells than memory is made for.
+        ConfigError: The cell length is out of range, or the grid has too many cells.
     """
     low_m, high_m = CELL_RANGE_M
     if not low_m <= cell_m <= high_m:
@@ -171,13 +177,13 @@ def _cut_hall(hall: HallConfig, plan: FloorPlan, cell_m: float) -> _Cuts:
 def _place_racks(
     boundary: F64, cuts: _Cuts, hall: HallConfig, plan: FloorPlan, airflow_m3s: F64
 ) -> tuple[RackFaces, RackFaces]:
-    """Let the air of the racks through their faces; gives inlet and exhaust faces.
+    """Add the airflow of the racks to ``boundary`` and return their inlet and exhaust faces.
 
     Args:
-        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); changed in place.
         cuts: Cells of the hall.
-        hall: Gives the racks per row.
-        plan: Gives where racks face.
+        hall: Configuration of the hall.
+        plan: Floor plan with the orientation of the racks.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
     """
     x, _, z = cuts.widths_m
@@ -204,14 +210,14 @@ def _place_racks(
 def _place_tiles_and_returns(
     boundary: F64, cuts: _Cuts, hall: HallConfig, airflow_m3s: F64, supply_m3s: float
 ) -> tuple[tuple[I32, F64], tuple[I32, F64]]:
-    """Let supply air in and return air out; gives cells and flows, in m3/s, of both.
+    """Add supply and return air to ``boundary`` and return cells and flows, in m3/s, of both.
 
     Args:
-        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); changed in place.
         cuts: Cells of the hall.
-        hall: Gives rows and where the returns are.
+        hall: Configuration of the hall.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
-        supply_m3s: Airflow of all floor tiles together, m3/s.
+        supply_m3s: Total airflow of the floor tiles, m3/s.
     """
     x, y, z = cuts.widths_m
     number, aisle_of_y = cuts.number, cuts.aisle_of_y
@@ -235,7 +241,7 @@ def _place_tiles_and_returns(
 
 
 def _strips_m(plan: FloorPlan, hall: HallConfig) -> F64:
-    """Depths of aisles and rows in turn, across the hall, in m, (2 rows + 1,)."""
+    """Return the depths of alternating aisles and rows across the hall, in m, (2 rows + 1,)."""
     row_y = plan.centre_m[:: hall.racks_per_row, 1]
     half = hall.layout.rack_depth_m / 2
     sides = np.stack([row_y - half, row_y + half], axis=1).ravel()
@@ -243,14 +249,14 @@ def _strips_m(plan: FloorPlan, hall: HallConfig) -> F64:
 
 
 def _cut(lengths_m: Iterable[float], cell_m: float, edges: Sequence[int]) -> tuple[F64, I32]:
-    """Widths of the cells of consecutive segments, in m, and the segment of each.
+    """Divide consecutive segments into cells; return cell widths, in m, and segment numbers.
 
-    Each segment has two cells or more, so that none hides a gradient.
+    Each segment has at least two cells, so that gradients within it are resolved.
 
     Args:
         lengths_m: Lengths of the segments, m.
-        cell_m: Longest cell, m.
-        edges: Segments after which an edge of a rack lies.
+        cell_m: Largest cell length, m.
+        edges: Numbers of the segments that end at a rack edge.
     """
     widths, owner = [], []
     for segment, length in enumerate(lengths_m):
@@ -267,10 +273,10 @@ def _cut(lengths_m: Iterable[float], cell_m: float, edges: Sequence[int]) -> tup
 
 
 def _links(cuts: _Cuts, hall: HallConfig) -> tuple[I32, F64, F64]:
-    """Cells beyond the faces, their conductances and the areas of all cells of air.
+    """Compute the neighbours, conductances and face areas of all air cells.
 
-    Containment closes the faces between the cold aisles below the top of the racks and the rest of
-    the hall, but for a leak.
+    Containment closes the faces between cold aisles (below the top of the racks) and the rest of
+    the hall, except for a leak.
 
     Returns:
         ``beyond``, ``conductance_m`` and ``area_m2`` of ``Grid``.
@@ -304,14 +310,14 @@ def _links(cuts: _Cuts, hall: HallConfig) -> tuple[I32, F64, F64]:
 
 
 def _open_faces(boundary: F64, numbers: I32, m3s: F64, face: int, sign: float) -> tuple[I32, F64]:
-    """Let air through the faces where ``m3s`` is positive; gives the cells and their flows.
+    """Add positive flows of ``m3s`` to ``boundary``; return their cells and values.
 
     Args:
-        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
-        numbers: Cells of a layer of the hall.
-        m3s: Flow through the face of each of them, m3/s.
-        face: Which of the six faces.
-        sign: 1 where the flow leaves the hall, -1 where it enters.
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); changed in place.
+        numbers: Indices of the cells of one layer of the hall.
+        m3s: Flow through a face of each of these cells, m3/s.
+        face: Index of the face, 0..5.
+        sign: 1 if the flow leaves the hall, -1 if it enters.
     """
     there = m3s > 0
     cell, flow = numbers[there], m3s[there]
@@ -320,7 +326,7 @@ def _open_faces(boundary: F64, numbers: I32, m3s: F64, face: int, sign: float) -
 
 
 def _rack_faces(faces: Sequence[tuple[I32, F64]]) -> RackFaces:
-    """Faces of all racks end to end, from cells and flows of each."""
+    """Concatenate the cells and flows of all racks into ``RackFaces``."""
     counts = [len(cell) for cell, _ in faces]
     return RackFaces(
         face_offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),

@@ -26,13 +26,14 @@ from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, buil
 from sdc_taichi.types import F64, I32
 
 MIXING_M = 0.3
-"""Eddy diffusivity divided by air speed, in m: half a floor tile. Upwind differences add as much on
-cells of 0.6 m; on smaller cells they add less, so that results do not depend on the cell length."""
+"""Eddy diffusivity divided by air speed, in m; the value is half the length of a floor tile. On
+cells of less than 0.6 m the numerical diffusion of upwind differences is smaller than this, so
+results do not depend on the cell length."""
 
 _TOLERANCE = 1e-13
-"""Residual of a linear system, divided by its right side, at which it counts as solved."""
+"""Tolerance of linear systems: norm of the residual divided by that of the right-hand side."""
 _MOST_ITERATIONS = 20_000
-"""Most iterations for one linear system."""
+"""Largest number of iterations for one linear system."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +41,15 @@ class LayoutSolution:
     """Air and temperatures of a hall of R racks at its design point."""
 
     R: F64
-    """Share of each rack's intake (rows) that is each rack's exhaust (columns), (R, R)."""
+    """Share of each source rack's exhaust (columns) in each rack's intake (rows), (R, R)."""
     supply_share: F64
-    """Share of each rack's intake that comes from the floor tiles, (R,)."""
+    """Share of air from the floor tiles in the intake of each rack, (R,)."""
     approach_k: F64
-    """Inlet of each rack above supply air, in K, (R,)."""
+    """Inlet temperature of each rack minus supply air, in K, (R,)."""
     supply_c: float
-    """Supply air, in C."""
+    """Supply air temperature, in C."""
     return_c: float
-    """Return air, in C."""
+    """Return air temperature, in C."""
     shi: float
     """Supply heat index, see ``air_metrics.shi``."""
     rhi: float
@@ -60,20 +61,20 @@ class LayoutSolution:
     rci_lo_pct: float
     """Rack cooling index at the low end against the allowable range of the ASHRAE class, in %."""
     mass_residual: float
-    """Sum over the cells of air that appears or vanishes, divided by the supply air."""
+    """Sum of the cells' absolute mass imbalances, divided by the supply airflow."""
     share_residual: float
-    """Largest departure of a row of R and its share of supply air from 1."""
+    """Largest deviation from 1 of the sum of a row of R and the rack's share of supply air."""
     energy_residual: float
-    """Heat that leaves by the returns less IT power, divided by IT power: the larger value of that
-    computed with R and that of the temperatures solved on the grid."""
+    """Absolute difference of return heat and IT power, divided by IT power. It is the larger value
+    of two computations: with R, and with temperatures solved directly on the grid."""
     direct_difference_k: float
-    """Largest difference of inlets computed with R from those solved on the grid, in K."""
+    """Largest difference of inlets computed with R and inlets solved on the grid, in K."""
     cells: int
-    """Cells that hold air."""
+    """Number of air cells."""
     seconds: float
-    """Time that the solution took, in s."""
+    """Computing time of the solution, in s."""
     provenance: dict[str, Any]
-    """Where the matrix comes from, for its file."""
+    """Provenance of the matrix, to be stored in its file."""
 
 
 def solve(
@@ -85,27 +86,27 @@ def solve(
     supply_c: float,
     cell_m: float = DEFAULT_CELL_M,
 ) -> LayoutSolution:
-    """Solve the air and the temperatures of a hall.
+    """Solve the airflow and the temperatures of a hall.
 
-    Potential flow: div(grad phi) = 0 in the air, with the given flows through rack faces, floor
-    tiles and returns. Tag i is 1 in the exhaust of rack i and 0 in all other air that enters:
-    div(u*c) = div(MIXING_M*|u|*grad c). Inlets follow from T_in = T_sup + R (T_out - T_sup), T_out
-    = T_in + P/(rho*cp*V) (Tang, Gupta and Varsamopoulos 2008), and once more from one solve on the
-    grid in which air passes the racks.
+    The airflow is a potential flow: div(grad phi) = 0 in the air, with given flows through rack
+    faces, floor tiles and returns. A scalar tag c for each rack is 1 in its exhaust and 0 in all
+    other air that enters the hall; it obeys div(u*c) = div(MIXING_M*|u|*grad c). The tags give R.
+    Inlets follow from T_in = T_sup + R (T_out - T_sup) and T_out = T_in + P/(rho*cp*V) (Tang, Gupta
+    and Varsamopoulos 2008). For comparison, the temperatures are also solved directly on the grid.
 
     Args:
-        config: Gives shape of the hall and properties of air.
+        config: Configuration of the data center.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
         power_w: IT power of each rack, W, (R,).
-        supply_m3s: Airflow of all CRAC units together, m3/s.
-        supply_c: Supply air, C.
-        cell_m: Longest cell, m.
+        supply_m3s: Total airflow of the CRAC units, m3/s.
+        supply_c: Supply air temperature, C.
+        cell_m: Largest cell length, m.
 
     Raises:
-        ConfigError: a cell length out of range, or too many cells or racks.
-        SdcError: a system that cannot be solved to the tolerance.
+        ConfigError: The cell length is out of range, or there are too many cells or racks.
+        SdcError: A linear system cannot be solved to the tolerance.
     """
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     hall = config.hall
     if hall.racks > MOST_MATRIX_RACKS:
         raise ConfigError(
@@ -137,7 +138,7 @@ def solve(
         ),
         direct_difference_k=float(np.abs(direct_k - approach_k).max()),
         cells=grid.cells,
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - start_s,
         provenance=_provenance(config, grid, cell_m, supply_m3s, supply_c),
     )
 
@@ -150,14 +151,14 @@ def _indices(
     inlet_c: F64,
     rise_k: F64,
 ) -> dict[str, float]:
-    """Indices of air management by their names in ``LayoutSolution``.
+    """Compute the indices of air management, by their names in ``LayoutSolution``.
 
     Args:
-        config: Gives the ASHRAE class.
+        config: Configuration with the ASHRAE class of the servers.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
-        supply_c: Supply air, C.
-        return_c: Return air, C.
-        inlet_c: Inlet of each rack, C, (R,).
+        supply_c: Supply air temperature, C.
+        return_c: Return air temperature, C.
+        inlet_c: Inlet temperature of each rack, C, (R,).
         rise_k: Temperature rise through each rack, K, (R,).
     """
     inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
@@ -177,10 +178,10 @@ def _indices(
 
 
 class _GridAir:
-    """Linear systems of one grid of N cells and R racks: the flow, its tags and its temperatures.
+    """Linear systems of a grid of N cells and R racks, for flow, exhaust tags and temperatures.
 
     Args:
-        grid: Cells, faces and given flows.
+        grid: Grid with the flows through its boundaries.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
     """
 
@@ -199,14 +200,14 @@ class _GridAir:
         self._diagonal = np.zeros(grid.cells)
 
     def find_flow(self) -> float:
-        """Solve the potential and set the coefficients of the tags.
+        """Solve the flow potential and compute the transport coefficients of the tags.
 
         Returns:
-            Sum over the cells of air that appears or vanishes, m3/s.
+            Sum of the cells' absolute mass imbalances, m3/s.
         """
         grid = self._grid
         diagonal = grid.conductance_m[:-1].sum(axis=1)
-        # All flows are given, so the level of the potential is free: the last cell fixes it.
+        # With given flows at all boundaries, the potential has a free constant. This term fixes it.
         diagonal[-1] *= 2.0
         entering = -grid.boundary_m3s[:-1].sum(axis=1)
         cells = np.arange(grid.cells, dtype=np.int32)
@@ -232,8 +233,8 @@ class _GridAir:
         """Solve one tag for the exhaust of each rack, and one for the supply air.
 
         Returns:
-            R, (R, R), share of supply air in the intake of each rack, (R,), and flow of every
-            rack's exhaust into the returns, m3/s, (R,).
+            Matrix of exhaust shares, (R, R), share of supply air in the intake of each rack, (R,),
+            and flow of each rack's exhaust into the returns, m3/s, (R,).
         """
         grid, backs = self._grid, self._grid.backs
         end = backs.face_offsets[-1] + len(grid.supply_cell)
@@ -241,19 +242,19 @@ class _GridAir:
         cell = np.concatenate([backs.cell, grid.supply_cell])
         amount = np.concatenate([backs.m3s, grid.supply_m3s])
         tags = self._solve(self._off_diagonal, self._diagonal, offsets, cell, amount, "tags")
-        # The exact shares are positive; the solver leaves zeros of either sign.
+        # Exact shares are not negative; remove rounding errors and negative zeros.
         shares = np.maximum(tags.intake, 0.0)
         return shares[:, :-1].copy(), shares[:, -1].copy(), tags.returned[:-1]
 
     def temperatures(self, rise_k: F64) -> tuple[F64, float]:
-        """Solve the temperatures of a hall in which air passes the racks.
+        """Solve the temperatures on a grid in which air flows through the racks.
 
         Args:
             rise_k: Temperature rise through each rack, K, (R,).
 
         Returns:
-            Inlets above supply air, K, (R,), and flow times temperature above supply air in the
-            returns, m3 K/s.
+            Inlet minus supply temperatures, K, (R,), and the sum over the returns of flow times
+            return minus supply temperature, m3 K/s.
         """
         backs = self._grid.backs
         amount = backs.m3s * np.repeat(rise_k, np.diff(backs.face_offsets))
@@ -280,19 +281,21 @@ class _GridAir:
         *,
         through_racks: bool = False,
     ) -> _SystemSolution:
-        """Solve one linear system for each right side, see ``kernels.airflow``.
+        """Solve a linear system for T right-hand sides, see ``kernels.airflow``.
 
         Args:
-            off_diagonal: Coefficients of the cells beyond the faces, (N + 1, 6).
+            off_diagonal: Coefficients of the neighbouring cells, (N + 1, 6).
             diagonal: Coefficient of each cell, (N,).
-            source_offsets: First source of each right side, and the number of sources, (T + 1,).
-            source_cell: Cell of each source.
-            source: What each source adds to the right side of its cell.
-            what: Name of the right sides, for errors.
-            through_racks: Whether the mean over the front of a rack enters the cells at its back.
+            source_offsets: Index of the first source of each right-hand side, and the number of
+                sources, (T + 1,).
+            source_cell: Cell of each source, (sources,).
+            source: Value that each source adds to the right-hand side of its cell, (sources,).
+            what: Name of the right-hand sides, for error messages.
+            through_racks: True if the mean value at a rack's front also enters the cells at its
+                back.
 
         Raises:
-            SdcError: a system that is not solved to the tolerance.
+            SdcError: A linear system cannot be solved to the tolerance.
         """
         grid, kernels = self._grid, self._kernels
         right_sides = len(source_offsets) - 1
@@ -345,33 +348,36 @@ class _GridAir:
 
 @dataclass(frozen=True, slots=True)
 class _SystemSolution:
-    """Solution of linear systems for T right sides, in the unit of their sources per flow."""
+    """Solution of a linear system for T right-hand sides.
+
+    Values have the unit of the sources divided by that of flow.
+    """
 
     first_solution: F64
-    """Values of the cells for the first right side, (N + 1,)."""
+    """Values of the cells for the first right-hand side, (N + 1,)."""
     intake: F64
-    """Mean value over the front of each rack, (R, T)."""
+    """Mean value at the front of each rack, (R, T)."""
     returned: F64
-    """Flow times value into the returns, (T,)."""
+    """Sum over the returns of flow times value, (T,)."""
     relative_residual: F64
-    """Norm of the residual divided by that of the right side, (T,)."""
+    """Norm of the residual divided by that of the right-hand side, (T,)."""
     iterations: I32
-    """Iterations done for each right side, (T,)."""
+    """Number of iterations for each right-hand side, (T,)."""
 
 
 def solve_at_design_point(
     config: DataCenterConfig, cell_m: float = DEFAULT_CELL_M
 ) -> LayoutSolution:
-    """Solve the air of a hall at full load and design supply air.
+    """Solve airflow and temperatures of a hall at full load and design supply temperature.
 
     Args:
         config: The data center.
-        cell_m: Longest cell, m.
+        cell_m: Largest cell length, m.
 
     Raises:
-        ConfigError: an outlet model that does not balance each server, values out of range, or too
-            many cells or racks.
-        SdcError: a system that cannot be solved to the tolerance.
+        ConfigError: The outlet model is not ``server``, the cell length is out of range, or there
+            are too many cells or racks.
+        SdcError: A linear system cannot be solved to the tolerance.
     """
     outlets = config.servers.outlet_model
     if outlets != "server":
@@ -380,7 +386,7 @@ def solve_at_design_point(
             "server by its own power; valid is server"
         )
     hall = config.hall
-    # CRAC units of contained halls are sized for the recirculation that containment leaves.
+    # With containment, the CRAC airflow depends on the remaining recirculation.
     contained = hall.layout.containment > 0 and hall.inlet_model == "recirculation"
     design = calibrate(config).design if contained else design_point(config)
     return solve(
@@ -396,7 +402,7 @@ def solve_at_design_point(
 def _provenance(
     config: DataCenterConfig, grid: Grid, cell_m: float, supply_m3s: float, supply_c: float
 ) -> dict[str, Any]:
-    """Provenance of a matrix, without date and computer: equal solutions give equal files."""
+    """Return the provenance of a matrix, without a date: equal solutions give equal files."""
     hall = config.hall
     return {
         "package": f"sdc-taichi {version('sdc-taichi')}",
