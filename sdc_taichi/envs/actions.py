@@ -266,17 +266,17 @@ def _checked_numbers(agent: str, action: npt.NDArray[Any]) -> F64:
     return np.minimum(np.maximum(action.astype(np.float64), -1.0), 1.0)
 
 
-def checked_array(given: Any, name: str) -> npt.NDArray[Any]:
+def checked_array(values: Any, name: str) -> npt.NDArray[Any]:
     """Convert a user's number, array or nested lists to an array of any type and shape.
 
     Args:
-        given: number, array or nested lists.
+        values: number, array or nested lists.
         name: name of the value in error messages.
 
     Raises:
         SdcError: the nested lists have different lengths.
     """
     try:
-        return np.asarray(given)
+        return np.asarray(values)
     except ValueError as error:
         raise SdcError(f"{name}: is no array ({error})") from None

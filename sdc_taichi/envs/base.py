@@ -254,25 +254,25 @@ class HasSpec:
         self._spec = spec
 
 
-def check_steps(given: Any, core: Core) -> int:
+def check_steps(max_steps: Any, core: Core) -> int:
     """Return the number of steps of an episode under Gymnasium's argument ``max_episode_steps``.
 
     Args:
-        given: value of ``max_episode_steps``; None and -1 mean no limit.
+        max_steps: value of ``max_episode_steps``; None and -1 mean no limit.
         core: batch of data centers.
 
     Raises:
-        ConfigError: ``given`` is not an integer, or exceeds the length of an episode.
+        ConfigError: ``max_steps`` is not an integer, or exceeds the length of an episode.
     """
-    if given is None or (given == -1 and not isinstance(given, bool)):
+    if max_steps is None or (max_steps == -1 and not isinstance(max_steps, bool)):
         return core.steps
-    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
-    if not whole or not 1 <= given <= core.steps:
+    whole = isinstance(max_steps, int | np.integer) and not isinstance(max_steps, bool)
+    if not whole or not 1 <= max_steps <= core.steps:
         raise ConfigError(
-            f"max_episode_steps {given!r}: valid is 1..{core.steps}, of which the last is an "
+            f"max_episode_steps {max_steps!r}: valid is 1..{core.steps}, of which the last is an "
             f"episode of days {core.options.days}"
         )
-    return int(given)
+    return int(max_steps)
 
 
 def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -60,21 +60,21 @@ def seeded_generators(
     ]
 
 
-def chosen_start_days(given: Any, num_envs: int) -> I64:
+def chosen_start_days(start: Any, num_envs: int) -> I64:
     """Return the first day of each episode as day of the year, from 0, (B,).
 
     Args:
-        given: day as ``MM-DD`` or as number of the day in the year, from 0; or one day for each
+        start: day as ``MM-DD`` or as number of the day in the year, from 0; or one day for each
             environment.
         num_envs: number of environments, B.
 
     Raises:
         ConfigError: a day is not valid, or the number of days is neither 1 nor ``num_envs``.
     """
-    if isinstance(given, np.ndarray) and given.ndim == 0:
-        given = given[()]
-    several = isinstance(given, list | tuple | np.ndarray)
-    days = np.array([_checked_day(day) for day in (given if several else [given])], dtype=np.int64)
+    if isinstance(start, np.ndarray) and start.ndim == 0:
+        start = start[()]
+    several = isinstance(start, list | tuple | np.ndarray)
+    days = np.array([_checked_day(day) for day in (start if several else [start])], dtype=np.int64)
     if len(days) not in (1, num_envs):
         raise ConfigError(f"start_day: {len(days)} days for {num_envs} environments")
     return np.broadcast_to(days, (num_envs,))
@@ -308,45 +308,45 @@ def _generator(state: Any) -> np.random.Generator:
 
 
 def _checked_commands(
-    given: Mapping[str, Any] | None, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
+    saved: Mapping[str, Any] | None, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
 ) -> dict[str, F64] | None:
     """Check the saved commands of the last step, (), (B,), (U,) or (R,) each.
 
     None stands for a state before the first step. A controller may leave the commands ``cooling``
     and ``placement`` at None; the saved state then lacks them.
     """
-    if given is None:
+    if saved is None:
         return None
     names = [*learned, *by_others]
     optional = {"cooling", "placement"}.intersection(by_others)
-    if not set(names) - optional <= set(given) <= set(names):
+    if not set(names) - optional <= set(saved) <= set(names):
         raise SdcError(
-            f"state: actions are {shortened(sorted(given))}; valid is a dict of {sorted(names)}"
+            f"state: actions are {shortened(sorted(saved))}; valid is a dict of {sorted(names)}"
         )
     of_parts = {"cooling": fleet.units, "fan": fleet.units, "placement": fleet.racks}
     return {
         name: _checked(
             f"actions of {name}",
-            given[name],
+            saved[name],
             np.float64,
             [(), (fleet.size,), (of_parts.get(name, fleet.size),)],
             *COMMAND_LIMITS[name],
         )
         for name in names
-        if name in given
+        if name in saved
     }
 
 
 def _checked(
     name: str,
-    given: Any,
+    values: Any,
     dtype: type[np.generic],
     shapes: Sequence[tuple[int, ...]],
     low: float,
     high: float,
 ) -> Any:
     """Check type, shape and range of an array in a saved state, and return a copy."""
-    array = as_array(f"state: {name}", given)
+    array = as_array(f"state: {name}", values)
     if array.shape not in shapes or array.dtype != dtype:
         raise SdcError(
             f"state: {name} are {array.dtype} {array.shape}; valid is {dtype.__name__} of "

@@ -321,15 +321,15 @@ def _configs(source: Any, overrides: Overrides) -> list[DataCenterConfig]:
     return [_with_overrides(_checked_config(one), overrides) for one in listed]
 
 
-def _checked_config(given: Any) -> DataCenterConfig:
-    if isinstance(given, Mapping):
-        return config_from_dict(dict(given))
-    if not isinstance(given, DataCenterConfig):
+def _checked_config(config: Any) -> DataCenterConfig:
+    if isinstance(config, Mapping):
+        return config_from_dict(dict(config))
+    if not isinstance(config, DataCenterConfig):
         raise ConfigError(
-            f"config {given!r}: valid is a preset, a file, DataCenterConfigs, or dicts of their "
+            f"config {config!r}: valid is a preset, a file, DataCenterConfigs, or dicts of their "
             "sections"
         )
-    return given
+    return config
 
 
 def _with_overrides(config: DataCenterConfig, overrides: Overrides) -> DataCenterConfig:
@@ -340,14 +340,14 @@ def _with_overrides(config: DataCenterConfig, overrides: Overrides) -> DataCente
     return apply_overrides(config, list(overrides))
 
 
-def _checked_overrides(given: Any) -> Overrides:
-    listed = isinstance(given, Mapping | Sequence) and not isinstance(given, str | bytes)
-    if not listed or not all(isinstance(one, str) for one in given):
+def _checked_overrides(value: Any) -> Overrides:
+    listed = isinstance(value, Mapping | Sequence) and not isinstance(value, str | bytes)
+    if not listed or not all(isinstance(one, str) for one in value):
         raise ConfigError(
-            f"overrides {given!r}: valid is a list of section.key=value, or a dict of section.key "
+            f"overrides {value!r}: valid is a list of section.key=value, or a dict of section.key "
             "to value"
         )
-    checked: Overrides = given
+    checked: Overrides = value
     return checked
 
 

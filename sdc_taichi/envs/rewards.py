@@ -233,9 +233,9 @@ def _peak_kw(before_kw: F64, result: StepResult) -> F64:
     return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
-def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+def _checked_scales(by_agent: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     """Check a user's scales; agents without an entry receive those of reward set ``default``."""
-    for agent, scales in given.items():
+    for agent, scales in by_agent.items():
         if agent not in AGENTS:
             raise ConfigError(
                 f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
@@ -254,16 +254,16 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
                     f"-{MOST_SCALE:g}..{MOST_SCALE:g}"
                 )
     return {
-        agent: dict(given.get(agent, definition.scales["default"]))
+        agent: dict(by_agent.get(agent, definition.scales["default"]))
         for agent, definition in AGENT_DEFINITIONS.items()
     }
 
 
-def _function_named(given: Any) -> RewardFunction:
+def _function_named(name: Any) -> RewardFunction:
     """Return the reward function with a registered name or an import path ``module:name``."""
     function: RewardFunction = function_named(
         "rewards",
-        given,
+        name,
         _registered,
         valid=f"{', '.join([*REWARD_SETS, *_registered])}, a dict of agent to term to scale",
     )

@@ -46,9 +46,9 @@ class AgentLearner:
         self.action_space: spaces.Space[Any] = core.action_spaces[self._agent]
         self.features = core.features[self._agent]
 
-    def actions(self, given: Any) -> dict[str, Any]:
+    def actions(self, values: Any) -> dict[str, Any]:
         """Convert the learner's actions to actions by agent; the values are the same."""
-        return {self._agent: given}
+        return {self._agent: values}
 
     def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Convert actions by agent to the learner's actions, (B,) or (B, k)."""
@@ -94,22 +94,22 @@ class JointLearner:
             self.observation_space = spaces.Dict({**first_space.spaces, "features": features})
         self.action_space = _actions_side_by_side([core.action_spaces[a] for a in core.agents])
 
-    def actions(self, given: Any) -> dict[str, Any]:
+    def actions(self, values: Any) -> dict[str, Any]:
         """Split the learner's actions, (B, k), into actions by agent.
 
         Raises:
             SdcError: the actions have a wrong shape.
         """
-        given = checked_array(given, "actions")
+        values = checked_array(values, "actions")
         shape = (self._core.num_envs, *(self.action_space.shape or ()))
-        if given.shape != shape:
-            raise SdcError(f"actions: shape {given.shape}, expected {shape}")
+        if values.shape != shape:
+            raise SdcError(f"actions: shape {values.shape}, expected {shape}")
         out: dict[str, Any] = {}
         first = 0
         for agent in self._core.agents:
             size = self._core.action_spaces[agent].shape
             width = size[0] if size else 1
-            out[agent] = given[:, first : first + width] if size else given[:, first]
+            out[agent] = values[:, first : first + width] if size else values[:, first]
             first += width
         return out
 

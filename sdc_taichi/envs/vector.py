@@ -112,14 +112,14 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         Raises:
             ConfigError: a seed, option or day is not valid.
         """
-        given: Any = dict(options) if isinstance(options, Mapping) else options
-        mask = given.pop("reset_mask", None) if isinstance(given, dict) else None
+        reset_options: Any = dict(options) if isinstance(options, Mapping) else options
+        mask = reset_options.pop("reset_mask", None) if isinstance(reset_options, dict) else None
         if mask is not None and not (np.shape(mask) == (self.num_envs,) and np.all(mask)):
             raise ConfigError(
                 "reset_mask: episodes of a batch start and end together; valid selects all "
                 f"{self.num_envs} environments"
             )
-        observations = self.core.reset(seed, start_day_option(given))
+        observations = self.core.reset(seed, start_day_option(reset_options))
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         return self._learner.observation(observations), self._infos(self.core.start_info())
 
@@ -378,9 +378,9 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
 vector_env = MultiAgentVectorEnv
 
 
-def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
+def _autoreset_mode(mode_name: AutoresetMode | str) -> AutoresetMode:
     try:
-        return AutoresetMode(given)
+        return AutoresetMode(mode_name)
     except ValueError:
         valid = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        raise ConfigError(f"autoreset_mode {given!r}: valid is {valid}") from None
+        raise ConfigError(f"autoreset_mode {mode_name!r}: valid is {valid}") from None

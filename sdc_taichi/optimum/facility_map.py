@@ -118,10 +118,10 @@ class FacilityMap:
         which, (lead_nodes, depression_nodes) = self.which[:, None], self.facility_kwh.shape[1:3]
         lead_c = wet_bulb_c if self.by_wet_bulb else outdoor_c
         lead_c = np.minimum(lead_c, self.last_c[which])
-        below_k = np.minimum(outdoor_c - wet_bulb_c, self.last_depression_k[which])
+        depression_k = np.minimum(outdoor_c - wet_bulb_c, self.last_depression_k[which])
         return (
             np.clip((lead_c - self.first_c[which]) / self.step_k, 0.0, lead_nodes - 1),
-            np.clip(below_k / self.depression_step_k[which], 0.0, depression_nodes - 1),
+            np.clip(depression_k / self.depression_step_k[which], 0.0, depression_nodes - 1),
         )
 
     def _in_weather(self, values: F64, lead: F64, depression: F64) -> F64:
@@ -133,11 +133,11 @@ class FacilityMap:
         at = (self.which[:, None] * wet + low) * dry + low_k
         added = (1,) * (values.ndim - 3)
         share, share_k = (x.reshape(*x.shape, *added) for x in (share, share_k))
-        found: F64 = flat[at] * ((1.0 - share) * (1.0 - share_k))
-        found += flat[at + dry] * (share * (1.0 - share_k))
-        found += flat[at + 1] * ((1.0 - share) * share_k)
-        found += flat[at + dry + 1] * (share * share_k)
-        return found
+        interpolated: F64 = flat[at] * ((1.0 - share) * (1.0 - share_k))
+        interpolated += flat[at + dry] * (share * (1.0 - share_k))
+        interpolated += flat[at + 1] * ((1.0 - share) * share_k)
+        interpolated += flat[at + dry + 1] * (share * share_k)
+        return interpolated
 
     def at_own_nodes(self, values: NDArray[Any]) -> list[NDArray[Any]]:
         """Return the values of each of the M maps without weather nodes that only pad the array.
@@ -204,8 +204,8 @@ def facility_map(
     ]
     tables: list[FacilityTable] = []
     for part in batches(fleet, nodes):
-        own = slice(len(tables), len(tables) + len(part))
-        at = weather.outdoor_c[own], weather.wet_bulb_c[own]
+        rows = slice(len(tables), len(tables) + len(part))
+        at = weather.outdoor_c[rows], weather.wet_bulb_c[rows]
         tables += tabulate(fleet, drivers, part, *at, precision)
     shape = len(dcs), *weather.shape, utilisations, setpoints
     return FacilityMap(
@@ -300,16 +300,16 @@ def _ranges(
         Minimum and maximum of the first weather axis, in C, and maximum wet-bulb depression, in K,
         (M,) each.
     """
-    found: dict[int, tuple[float, float, float]] = {}
+    ranges: dict[int, tuple[float, float, float]] = {}
     for dc, entry in enumerate(which.tolist()):
-        if entry not in found:
+        if entry not in ranges:
             both = drivers.outdoor_c, drivers.wet_bulb_c
             length = max(int(series.lengths[dc]) for series in both)
             outdoor_c, wet_bulb_c = (_year_of(series, dc, length) for series in both)
             lead_c = wet_bulb_c if by_wet_bulb else outdoor_c
             most_k = float(np.max(outdoor_c - wet_bulb_c)) + margin_k
-            found[entry] = float(lead_c.min()) - margin_k, float(lead_c.max()) + margin_k, most_k
-    low_c, high_c, most_k = np.array([found[entry] for entry in range(len(found))]).T
+            ranges[entry] = float(lead_c.min()) - margin_k, float(lead_c.max()) + margin_k, most_k
+    low_c, high_c, most_k = np.array([ranges[entry] for entry in range(len(ranges))]).T
     return low_c, high_c, most_k
 
 

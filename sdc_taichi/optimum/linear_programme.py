@@ -319,13 +319,13 @@ def _bound_in_windows(
         end - 1: _border_prices(problem, stage, span, (end - 1, end - 1), around, solve)
         for end in ends[:-1]
     }
-    held: dict[int, tuple[float, float]] = {}
+    end_prices: dict[int, tuple[float, float]] = {}
     task = kwh = 0.0
     if span.as_after is not None:
         pair = (span.end - 1, span.as_after)
         task, kwh = _border_prices(problem, stage, span, pair, around, solve)
         task, kwh = max(task, 0.0), max(kwh, 0.0)
-        held = {span.end - 1: (task, kwh), span.as_after: (-task, -kwh)}
+        end_prices = {span.end - 1: (task, kwh), span.as_after: (-task, -kwh)}
     parts = []
     for begin, end in zip([span.first, *ends[:-1]], ends, strict=True):
         inside = replace(
@@ -333,7 +333,7 @@ def _bound_in_windows(
             first=begin,
             end=end,
             as_after=None,
-            state_values=_state_values(prices, held, begin, end),
+            state_values=_state_values(prices, end_prices, begin, end),
         )
         if begin > span.first:
             inside = replace(inside, start_kwh=None, start_tasks=None, deferred_before=None)

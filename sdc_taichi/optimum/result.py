@@ -98,8 +98,8 @@ class Optimum:
             kwh, tasks = start_kwh[i], start_tasks[i]
             if (end_kwh[i], end_tasks[i]) == (kwh, tasks):
                 continue
-            own, cyclic = Ends(kwh, tasks, end_kwh[i], end_tasks[i]), Ends(kwh, tasks, kwh, tasks)
-            value[i] = self.bound_of_ends(i, own) - self.bound_of_ends(i, cyclic)
+            ends, cyclic = Ends(kwh, tasks, end_kwh[i], end_tasks[i]), Ends(kwh, tasks, kwh, tasks)
+            value[i] = self.bound_of_ends(i, ends) - self.bound_of_ends(i, cyclic)
         return value
 
 
@@ -130,8 +130,8 @@ class BoundOfEnds:
         if self._kinds[dc].startswith("none"):
             return float("nan")
         if dc not in self._known:
-            kept = {} if self._cache is None else self._cache.find_ends(self._keys[dc])
-            self._known[dc] = kept
+            cached = {} if self._cache is None else self._cache.find_ends(self._keys[dc])
+            self._known[dc] = cached
         known = self._known[dc]
         if ends not in known:
             known[ends] = bound(self._problem_of(dc), ends).figure

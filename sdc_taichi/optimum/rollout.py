@@ -1,4 +1,4 @@
-"""Plans run by the simulator: commands that follow them, figures, and kept constraints."""
+"""Simulation of plans: commands that follow target states, resulting figures, and constraints."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """States that B data centers are to reach in T steps.
+    """Target states of B data centers in each of T steps.
 
-    A step that falls short of its target is made up for by the steps after it.
+    Later steps compensate for a target that a step misses.
     """
 
     queue_tasks: F64
-    """Work in the queue after each step, in tasks, (T, B); nan leaves the load command neutral."""
+    """Work in the queue after each step, in tasks, (T, B); nan means a neutral load command."""
     setpoint_c: F64
     """Setpoint of each step, in C, (T, B)."""
     stored_kwh: F64
-    """Energy stored after each step, in kWh, (T, B); nan leaves the battery idle."""
+    """Energy stored after each step, in kWh, (T, B); nan means an idle battery."""
     facility_kwh: F64
-    """Energy that the facility is expected to need in each step, in kWh, (T, B)."""
+    """Expected energy of the facility in each step, in kWh, (T, B)."""
 
 
 @dataclass(frozen=True, slots=True)
 class RollOut:
-    """Results of the simulator in T steps of B data centers."""
+    """Simulated results of B data centers in each of T steps."""
 
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (T, B)."""
@@ -56,7 +56,7 @@ class RollOut:
     carbon_g: F64
     """Emissions of the energy bought, in g CO2e, (T, B)."""
     energy_cost: F64
-    """Price of the energy bought, in the currency of the tariff, (T, B)."""
+    """Cost of the energy bought, in the currency of the tariff, (T, B)."""
     queue_tasks: F64
     """Work in the queue after each step, in tasks, (T, B)."""
     stored_kwh: F64
@@ -64,11 +64,11 @@ class RollOut:
     setpoint_c: F64
     """Mean setpoint of the CRAC units, in C, (T, B)."""
     inlet_max_c: F64
-    """Hottest inlet of a server, in C, (T, B)."""
+    """Highest inlet temperature of all servers, in C, (T, B)."""
     dropped_tasks: F64
-    """Work that found the queue full, in tasks, (T, B)."""
+    """Work dropped because the queue was full, in tasks, (T, B)."""
     utilisation: F64
-    """Work that was started, as a share of capacity, (T, B)."""
+    """Executed work, as a share of capacity, (T, B)."""
     load_command: F64
     """Load command, -1..1, (T, B)."""
     cooling_command: F64
@@ -77,10 +77,10 @@ class RollOut:
     """Battery command, -1..1, (T, B)."""
 
     def of(self, where: Sequence[int]) -> RollOut:
-        """Copy with some of the data centers.
+        """Return the results of some of the data centers.
 
         Args:
-            where: their numbers.
+            where: indices of the data centers.
         """
         return RollOut(*(getattr(self, f.name)[:, list(where)] for f in fields(self)))
 
@@ -97,26 +97,27 @@ def roll_out(
     precision: Precision = "f32",
     on_step: Callable[[], None] = lambda: None,
 ) -> tuple[RollOut, Score]:
-    """Run plans in the simulator: commands are computed at the true state of every step.
+    """Simulate B data centers with commands that follow target states.
 
-    All CRAC units of a data center move alike.
+    The commands of a step are computed from the simulator's state before the step. All CRAC units
+    of a data center have the same setpoint.
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs.
-        targets: States that they are to reach.
-        start: First step of each, counted from the beginning of the year, (B,).
-        objective: Objective that the figure counts.
-        scored_from: First step that is scored.
-        seed: Of the sampled events, one for all or for each data center, (B,).
-        precision: Of the hall kernels.
+        drivers: Inputs of the data centers.
+        targets: Target states of each step.
+        start: First step of each data center, counted from the beginning of the year, (B,).
+        objective: Objective whose value the figure is.
+        scored_from: Number of the first scored step.
+        seed: Seed of the sampled events, one for all data centers or one for each, (B,).
+        precision: Floating-point precision of the hall kernels.
         on_step: Called after every step; an error that it raises ends the work.
 
     Returns:
         Results of all steps, and their score.
 
     Raises:
-        PhysicalLimitError: A result that no data center can reach.
+        PhysicalLimitError: A result is outside the physical limits.
     """
     steps = len(targets.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
@@ -134,13 +135,13 @@ def roll_out(
 
 
 class Follower:
-    """Commands that take data centers to their targets.
+    """Computes commands that bring B data centers to their target states.
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs, with the first step of the run.
-        sizing: Capacities of their devices.
-        targets: States that they are to reach.
+        drivers: Inputs of the data centers, with the first step of the run.
+        sizing: Device sizes of the data centers.
+        targets: Target states of each step.
     """
 
     def __init__(self, fleet: Fleet, drivers: Drivers, sizing: Sizing, targets: Targets) -> None:
@@ -166,10 +167,10 @@ class Follower:
         self._unit_dc = fleet.unit_dc
 
     def actions(self, state: State) -> Actions:
-        """Commands of the step to come.
+        """Return the commands of the coming step.
 
         Args:
-            state: State before the step.
+            state: State of the simulator before the step.
         """
         return Actions(
             load=self._load(state),
@@ -224,18 +225,19 @@ def load_command(
     max_utilisation: F64,
     queue_limit_tasks: F64,
 ) -> F64:
-    """Load command by which a step does some amount of work, or comes as close as it can, (B,).
+    """Return the load command under which a step executes a given amount of work, (B,).
 
-    It inverts the models of ``plant.workload``. Work whose deadline has come runs in any case, and
-    no more is deferred than fits into the queue, so that nothing is dropped for a plan. Model
-    ``tasks`` does the nearest whole number of tasks.
+    The function inverts the workload models of ``plant.workload``. If the amount is impossible, the
+    command comes as close as it can. Due work is always executed. Deferred work never exceeds the
+    room in the queue, so following a plan drops no work. Model ``tasks`` executes the nearest whole
+    number of tasks.
 
     Args:
-        executed_tasks: work to do, in tasks, (B,).
-        model: name of the model of work, ``fluid`` or ``tasks``.
+        executed_tasks: work to execute, in tasks, (B,).
+        model: name of the workload model, ``fluid`` or ``tasks``.
         demand: work that arrives, as a share of capacity, 0..1, (B,).
         waiting_tasks: work in the queue, in tasks, (B,).
-        due_tasks: part of it whose deadline has come, in tasks, (B,).
+        due_tasks: work in the queue whose deadline has come, in tasks, (B,).
         flexible_share: share of the demand that may wait, 0..1, (B,).
         max_utilisation: highest utilisation, 0..1, (B,).
         queue_limit_tasks: longest queue, in tasks, (B,).
@@ -255,7 +257,7 @@ def load_command(
 def _fluid_command(
     executed: F64, demand: F64, waiting: F64, due: F64, flexible_share: F64, cap: F64, limit: F64
 ) -> F64:
-    """Load command of model ``fluid``, (B,); see ``load_command``."""
+    """Return the load command for workload model ``fluid``, (B,); see ``load_command``."""
     arrived, capacity = demand * TASKS_PER_STEP, cap * TASKS_PER_STEP
     forced = np.minimum(due, capacity)
     room = np.maximum(limit - (waiting - forced), 0.0)
@@ -271,7 +273,7 @@ def _fluid_command(
 def _tasks_command(
     executed: F64, demand: F64, waiting: F64, due: F64, flexible_share: F64, cap: F64, limit: F64
 ) -> F64:
-    """Load command of model ``tasks``, (B,); see ``load_command``."""
+    """Return the load command for workload model ``tasks``, (B,); see ``load_command``."""
     flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
     arrived = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP) + flexible
     capacity = np.floor(cap * TASKS_PER_STEP)
@@ -281,7 +283,7 @@ def _tasks_command(
     free = np.maximum(capacity - arrived - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     held_back = np.minimum(np.minimum(-more, flexible), np.floor(room))
-    # The models round down: half a task more than a whole number gives just this number.
+    # The workload model rounds down, so half a task is added to obtain exactly the whole number.
     drain = np.where(more > 0, _share(more + 0.5, drainable), 0.0)
     defer = np.where(held_back > 0, _share(held_back + 0.5, flexible), 0.0)
     return np.where(more >= 0, drain, -defer)
@@ -297,17 +299,19 @@ def battery_command(
     capacity_kwh: F64,
     parameters: BatteryParameters,
 ) -> F64:
-    """Battery command by which a step draws or delivers some energy, or as much as it can, (B,).
+    """Return the battery command under which a step draws or delivers a given energy, (B,).
+
+    If the energy is impossible, the command comes as close as it can.
 
     Args:
-        bus_kwh: energy to draw from the bus into the battery, below 0 to deliver, in kWh, (B,).
+        bus_kwh: energy that the battery draws from the bus, in kWh, (B,); negative if it delivers.
         model: name of the battery model.
-        stored_kwh: energy in the store before the step, in kWh, (B,).
-        load_kw: power that the facility is expected to draw, in kW, (B,).
+        stored_kwh: stored energy before the step, in kWh, (B,).
+        load_kw: expected power of the facility, in kW, (B,).
         step_h: length of the step, in h.
-        capacity_kwh: capacity, in kWh, (B,).
-        parameters: efficiencies, rates and limits, (B,) each; the limit of the grid connection is
-            left to the model.
+        capacity_kwh: capacity of the battery, in kWh, (B,).
+        parameters: efficiencies, rates and limits, (B,) each. The limit of the grid connection is
+            ignored here; the simulator applies it.
     """
     charges = bus_kwh >= 0
     full = BATTERIES[model].step(
@@ -322,43 +326,46 @@ def battery_command(
 def bus_energy_kwh(
     target_kwh: F64, stored_kwh: F64, *, charge_efficiency: F64, discharge_factor: F64
 ) -> F64:
-    """Energy to draw from the bus, below 0 to deliver, that brings a store to a target, kWh, (B,).
+    """Return the energy that a battery must draw from the bus to store a target energy, kWh, (B,).
+
+    The energy is negative if the battery must deliver.
 
     Args:
-        target_kwh: energy to be stored, in kWh, (B,).
-        stored_kwh: energy in the store, in kWh, (B,).
-        charge_efficiency: energy stored per energy drawn, (B,).
-        discharge_factor: energy taken from the store per energy delivered, (B,).
+        target_kwh: target of the stored energy, in kWh, (B,).
+        stored_kwh: stored energy, in kWh, (B,).
+        charge_efficiency: ratio of stored energy to energy drawn, (B,).
+        discharge_factor: ratio of energy taken from the store to energy delivered, (B,).
     """
     rise_kwh = target_kwh - stored_kwh
     return np.where(rise_kwh >= 0, rise_kwh / charge_efficiency, rise_kwh / discharge_factor)
 
 
 def _share(part: F64, whole: F64) -> F64:
-    """Part of a whole, within 0..1; 0 where there is nothing to share."""
+    """Return part divided by whole, clipped to 0..1; 0 if the whole is not positive."""
     some = whole > 0
     return np.where(some, np.clip(part / np.where(some, whole, 1.0), 0.0, 1.0), 0.0)
 
 
 LARGEST_TABLE_ERROR = 1e-4
-"""Largest error of a table, as a share of the energy, with which a bound still is one."""
+"""Maximum error of a table, as a share of the energy, for a bound to count as ``bound``. Larger
+errors make it an ``estimate``."""
 _LEAST_TASKS = 1e-6
-"""Work that rounding may leave, in tasks."""
+"""Tolerance of constraints on work for rounding errors, in tasks."""
 LEAST_K = 1e-3
-"""Temperature by which the precision of the kernels may exceed a limit, in K."""
+"""Tolerance of temperature limits for the precision of the kernels, in K."""
 _LEAST_STORED_SHARE = 1e-6
-"""Share of the capacity that may be missing from the battery at the end."""
+"""Tolerance of the stored energy at the end, as a share of capacity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Measurements of the simulator in the scored steps along a path of one data center."""
+    """Measurements in the scored steps of one simulated plan of a data center."""
 
     figure: float
-    """Figure of the scored steps, in the unit of the objective."""
+    """Value of the objective in the scored steps."""
     table_error: float
-    """Sum of the absolute differences of the facility's energy in each step from the table at the
-    utilisation and setpoint of the step, divided by the energy of all steps."""
+    """Relative error of the table: the sum of absolute differences between simulated and tabulated
+    energy of each step, divided by the simulated energy of all steps."""
     start_kwh: float
     """Energy stored at the first scored step, in kWh."""
     end_kwh: float
@@ -368,19 +375,19 @@ class Certificate:
     end_tasks: float
     """Work that waits at the end, in tasks."""
     dropped_tasks: float
-    """Work that finds the queue full, in tasks."""
+    """Work dropped because the queue is full, in tasks."""
     overdue_tasks: float
-    """Most due work that does not fit into a step, in tasks."""
+    """Maximum due work that a step cannot execute, in tasks."""
     hottest_inlet_c: float
-    """Hottest inlet, in C."""
+    """Highest inlet temperature, in C."""
     over_limit_k: float
-    """Most by which an inlet exceeds the limit, or the coolest of all setpoints where none keeps
-    it, in K."""
+    """Maximum excess of an inlet over the limit, in K. In steps in which no setpoint satisfies the
+    limit, the lowest inlet temperature of all setpoints takes its place."""
     unmet_kwh: float
-    """Cooling load that stays in the room, in kWh."""
+    """Heat that the cooling does not remove from the room, in kWh."""
 
     def failures(self, idle: Certificate, capacity_kwh: float) -> tuple[str, ...]:
-        """Constraints that the path breaks, in words; none where it counts as achieved.
+        """Return the constraints that the plan breaks, in words; empty for a valid plan.
 
         Args:
             idle: Certificate of idle commands.
@@ -408,13 +415,13 @@ class Certificate:
 def broken_constraints(
     dropped_more: float, overdue: tuple[float, float], hot: str, unmet_kwh: tuple[float, float]
 ) -> list[str]:
-    """Constraints that a run breaks although another run keeps them, in words.
+    """Return the constraints that a run breaks, compared with a reference run, in words.
 
     Args:
-        dropped_more: Work that is dropped beyond that of idle commands, in tasks.
-        overdue: Most overdue work of the run and of the other, in tasks.
-        hot: Text about inlets over their limit; empty where they keep it.
-        unmet_kwh: Heat that stays in the room in the run and in the other, in kWh.
+        dropped_more: Work dropped in addition to that under idle commands, in tasks.
+        overdue: Maximum overdue work of the run and of the reference run, in tasks.
+        hot: Text about inlets above their limit; empty if there are none.
+        unmet_kwh: Heat not removed from the room in the run and in the reference run, in kWh.
     """
     texts = []
     if dropped_more > _LEAST_TASKS:
@@ -429,13 +436,13 @@ def broken_constraints(
 
 
 def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certificate:
-    """Measurements of the simulator along one path, and their distance from the table.
+    """Measure the constraints, the figure and the table error of one simulated plan.
 
     Args:
         problem: Planning problem of the data center.
-        done: Results of this path alone.
-        score: Score of several paths.
-        i: Number of the path in the score.
+        done: Simulated results of this plan alone.
+        score: Score of all plans that were simulated together.
+        i: Index of this plan in the score.
     """
     scored = slice(problem.scored_from, None)
     measured = done.facility_kwh[scored, 0]
@@ -456,7 +463,10 @@ def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certif
 
 
 def _over_limit_k(problem: Problem, done: RollOut) -> F64:
-    """By how much the hottest inlet of each step exceeds what it has to keep, in K, (T,)."""
+    """Return the excess of the hottest inlet over its limit in each step, in K, (T,).
+
+    If no setpoint satisfies the limit, the lowest inlet of all setpoints takes its place.
+    """
     table, limit_c = problem.table, problem.inlet_limit_c
     if np.isinf(limit_c):
         return np.zeros(problem.steps)

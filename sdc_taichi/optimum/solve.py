@@ -1,4 +1,4 @@
-"""Bound and achieved figure of data centers: tables, programmes, and runs of the simulator."""
+"""Computation of optima: tables, bounds and plans of data centers, and simulation of the plans."""
 
 from __future__ import annotations
 
@@ -56,14 +56,13 @@ from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64
 
 _LEAST_ENERGY_ERROR = 1e-6
-"""Relative difference between measured and planned energy below which no battery is planned again.
-"""
+"""Relative difference between simulated and planned energy that causes a new battery plan."""
 _BOUND = "bound"
-"""Name of the bound beside those of paths."""
+"""Key of the bound in a dict that otherwise contains paths by name."""
 _SOLVER_ERROR = 1e-6
-"""Relative error of the bound from solvers and from what paths leave at the end."""
+"""Margin of the bound for the errors of solvers and for tolerances of the end state, relative."""
 _AGAIN = "all agents with the battery planned again"
-"""Name of the path whose battery is planned for the energy that the simulator measured."""
+"""Name of the path whose battery is planned for the simulated energy of the facility."""
 _POLL_S = 0.2
 """Time between two calls of ``stop``, in s."""
 
@@ -88,33 +87,35 @@ def solve(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Optimum:
-    """Find what the best controllers of data centers can reach when all inputs are known.
+    """Compute how well the best controllers of data centers can do if all inputs are known.
 
-    The bound is that of ``linear_programme.bound``; the achieved figure is the best of several
-    plans that the simulator has run and that keep the constraints.
+    The bound comes from ``linear_programme.bound``. The achieved figure is that of the best plan
+    among several that were simulated and satisfy the constraints.
 
     Args:
-        configs: A fleet, one config or several, B.
+        configs: A fleet, one config or several configs of B data centers.
         steps: Number of steps, T.
-        start: First step of each, counted from the beginning of the year, (B,); None is that of
-            the drivers.
-        seed: Of the sampled events.
-        drivers: Inputs; None reads what the configs name.
-        objective: Objective to minimise, or its text.
-        agents: Agents that plans may move.
-        scored_from: First step that is scored; where it is not 0, plans end in the state that they
-            have there.
-        inlet_limit_c: Highest inlet that plans may cause where they have a choice, in C; None is
-            the limit of ``protection.ashrae_class``, and none where that is not set.
+        start: First step of each data center, counted from the beginning of the year, (B,). None
+            means the first step of the drivers.
+        seed: Seed of the sampled events.
+        drivers: Inputs of the data centers; None reads the inputs that the configs name.
+        objective: Objective to minimise, as object or text.
+        agents: Agents that plans may control.
+        scored_from: Number of the first scored step. If it is not 0, plans must end in the state of
+            this step.
+        inlet_limit_c: Highest inlet temperature that plans may cause if another setpoint avoids it,
+            in C. None means the limit of ``protection.ashrae_class``, or no limit without it.
         precision: Floating-point precision of the hall kernels.
-        cache: Whether to read and keep results among the user's caches, or a folder for them.
-        progress: Progress callback.
-        stop: Returns whether to end the work; what has been solved is kept.
+        cache: True to read and write results in the user's cache, False for no cache, or the
+            folder of a cache.
+        progress: Progress callback ``(stage, done, total)``.
+        stop: Called regularly; the work ends if it returns True. Finished results stay in the
+            cache.
 
     Raises:
-        ConfigError: An argument that is not valid.
-        StoppedError: ``stop`` was true.
-        PhysicalLimitError: A result that no data center can reach.
+        ConfigError: An argument is not valid.
+        StoppedError: ``stop`` returned True.
+        PhysicalLimitError: A simulated result is outside the physical limits.
     """
     fleet = configs if isinstance(configs, Fleet) else build_fleet(configs)
     steps = whole_number("steps", steps, 1, MOST_STEPS)
@@ -141,13 +142,13 @@ def solve(
         inlet_limit_c=inlet_limit_c,
         precision=precision,
     )
-    kept = None if cache is False else Cache(None if cache is True else Path(cache))
+    used_cache = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
-    return _optimum(task, work.entries(task, kept), kept)
+    return _optimum(task, work.entries(task, used_cache), used_cache)
 
 
 def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optimum:
-    """The optimum of a task, from what is known of each data center."""
+    """Join the entries of B data centers to one ``Optimum``."""
 
     def each(name: str) -> F64:
         return np.array([getattr(entry, name) for entry in entries], dtype=np.float64)
@@ -183,36 +184,36 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A path of one data center that the simulator has run."""
+    """A simulated plan of one data center."""
 
     path: Targets
-    """States that it was to reach."""
+    """Target states of the plan."""
     done: RollOut
-    """Results of the simulator."""
+    """Simulated results of each step."""
     certificate: Certificate
-    """Measurements in the scored steps."""
+    """Figure and constraints, measured in the scored steps."""
 
 
 @dataclass(slots=True)
 class _Case:
-    """A data center with its bound and the runs so far."""
+    """Intermediate results of one data center: its bound and its simulated plans."""
 
     problem: Problem
-    """Its planning problem."""
+    """Planning problem of the data center."""
     no_bound: str | None
-    """Why there is no bound, in words; None where there is one."""
+    """Reason why there is no bound, in words; None if there is a bound."""
     bound: float = float("nan")
-    """Bound of the figure; nan without one."""
+    """Lower bound of the figure; nan if there is none."""
     runs: dict[str, _Run] = field(default_factory=dict)
-    """Paths that have been run, by name."""
+    """Plans simulated so far, by name."""
 
     @property
     def joint(self) -> _Run:
-        """The run that moves all agents."""
+        """Simulated plan that moves all agents of the problem."""
         return self.runs[JOINT if JOINT in self.runs else self.problem.agents[0]]
 
     def entry(self) -> Entry:
-        """Bound, achieved figure and path of the data center, from all its runs."""
+        """Return the cache entry with the bound, the best simulated plan and its figure."""
         certificates = {name: run.certificate for name, run in self.runs.items()}
         idle = certificates[IDLE]
         failures = {
@@ -230,7 +231,7 @@ class _Case:
         return Entry(
             idle=idle.figure,
             idle_dropped_tasks=idle.dropped_tasks,
-            # By as much as tables were found to differ from the simulator, and solvers may err.
+            # Lower the bound by the measured error of the tables and the error of the solvers.
             bound=self.bound - (error + _SOLVER_ERROR) * abs(self.bound),
             achieved=certificates[best].figure,
             alone={
@@ -250,7 +251,12 @@ class _Case:
 
 
 def _kind(reason: str | None, error: float) -> str:
-    """Kind of a bound, in words."""
+    """Return the kind of a bound, in words.
+
+    Args:
+        reason: Reason why there is no bound, or None.
+        error: Relative error of the table in the simulated plans.
+    """
     if reason is not None:
         return f"none: {reason}"
     if error > LARGEST_TABLE_ERROR:
@@ -264,12 +270,12 @@ def _kind(reason: str | None, error: float) -> str:
 def _bound_or_path(
     case: _Case, name: str, check: Callable[[], None]
 ) -> float | Targets | ConfigError:
-    """Bound or path of a data center; an error where no plan keeps the limits.
+    """Compute the bound or one path of a data center; return the error if no plan is valid.
 
     Args:
         case: The data center.
         name: ``_BOUND`` or the name of a path.
-        check: Raises an error to end the work.
+        check: Called regularly; an error that it raises ends the work.
     """
     try:
         if name != _BOUND:
@@ -280,11 +286,11 @@ def _bound_or_path(
 
 
 class _Work:
-    """The work of solving a task, stage by stage.
+    """Solves a task stage by stage, with progress reports and a way to stop.
 
     Args:
-        progress: Progress callback.
-        stop: Returns whether to end the work.
+        progress: Progress callback ``(stage, done, total)``.
+        stop: Called regularly; the work ends if it returns True.
     """
 
     def __init__(self, progress: Progress, stop: Callable[[], bool]) -> None:
@@ -292,14 +298,14 @@ class _Work:
         self._all = self._kept = self._missing = self._solved = self._size = 0
 
     def entries(self, task: Task, cache: Cache | None) -> list[Entry]:
-        """Bound, achieved figure and path of each data center, B.
+        """Return the entry of each of B data centers, from the cache or newly computed.
 
         Args:
-            task: The data centers.
-            cache: Where entries are kept; None keeps none.
+            task: The data centers with their inputs and options.
+            cache: Cache of entries; None uses no cache.
 
         Raises:
-            StoppedError: The work was stopped.
+            StoppedError: The caller stopped the work.
         """
         keys = [""] * task.fleet.size if cache is None else task.keys()
         entries: dict[int, Entry] = {}
@@ -319,7 +325,7 @@ class _Work:
         return [entries[i] for i in range(task.fleet.size)]
 
     def _solve(self, task: Task) -> list[_Case]:
-        """Bounds and runs of data centers whose tables fit into memory together, B."""
+        """Compute bounds and simulate plans of B data centers whose tables fit into memory."""
         problems = task.problems(lambda done, total: self._tell("tables", done / total, task.steps))
         cases = [
             _Case(
@@ -335,7 +341,7 @@ class _Work:
         return cases
 
     def _bounds_and_paths(self, cases: Sequence[_Case]) -> list[dict[str, Targets]]:
-        """Find the bound of each data center, and its paths by name, B."""
+        """Compute the bound and the paths of each of B data centers; return the paths by name."""
         names = [*reversed(agents_of(cases[0].problem)), _BOUND]
         results = self._in_threads(
             [partial(_bound_or_path, case, name) for case in cases for name in names]
@@ -355,11 +361,11 @@ class _Work:
         return paths
 
     def _plan_batteries_again(self, task: Task, cases: Sequence[_Case]) -> None:
-        """Where the energy is not what was planned for, add a run whose battery suits it."""
+        """Plan batteries again for the simulated energy, if it differs from the planned energy."""
         chosen = []
         for i, case in enumerate(cases):
-            planned, found = case.joint.path.facility_kwh, case.joint.done.facility_kwh
-            error = float(np.abs(planned - found).sum() / found.sum())
+            planned, simulated = case.joint.path.facility_kwh, case.joint.done.facility_kwh
+            error = float(np.abs(planned - simulated).sum() / simulated.sum())
             if "battery" in case.problem.agents and error > _LEAST_ENERGY_ERROR:
                 chosen.append(i)
         if not chosen:
@@ -374,11 +380,11 @@ class _Work:
         self._run(task.part(chosen), again, [{_AGAIN: path} for path in paths])
 
     def _in_threads(self, calls: Sequence[Callable[[Callable[[], None]], _X]]) -> list[_X]:
-        """Results of programmes, several solved at a time.
+        """Call functions in parallel threads and return their results in order.
 
         Args:
-            calls: Functions of what raises an error to end the work, which leave the interpreter
-                to others for most of their time.
+            calls: Functions that release Python's global lock most of the time. Their argument is a
+                function that raises an error if the work is to end.
         """
         pool, ends = ThreadPoolExecutor(runtime.ensure_started()), Event()
 
@@ -401,13 +407,13 @@ class _Work:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _tell(self, stage: str, share: float, steps: int) -> None:
-        """Report the share of a stage that the present part has done, in steps of data centers."""
+        """Report the progress of a stage in the current part, in steps times data centers."""
         done = self._solved + share * self._size
         self._progress(stage, round(done * steps), self._missing * steps)
         self._go_on()
 
     def _go_on(self) -> None:
-        """Raise a ``StoppedError`` if the work is to end."""
+        """Raise a ``StoppedError`` if the caller has stopped the work."""
         if self._stop():
             raise self._stopped()
 
@@ -417,15 +423,15 @@ class _Work:
     def _run(
         self, task: Task, cases: Sequence[_Case], paths: Sequence[Mapping[str, Targets]]
     ) -> None:
-        """Run the paths of each data center in the simulator, all in one batch.
+        """Simulate all paths of B data centers in one batch.
 
         Args:
-            task: The data centers, B.
-            cases: The same, B, to which the runs are added.
-            paths: Paths of each, of the same names, B.
+            task: The B data centers with their inputs and options.
+            cases: Results of the data centers, B; the simulated paths are added to ``runs``.
+            paths: Paths of each data center by name, B; all data centers have the same names.
         """
         names, size, steps = list(paths[0]), task.fleet.size, 0
-        # Path k of data center i is number k*B + i.
+        # Path k of data center i has index k*B + i in the batch.
         in_order = [of_case[name] for name in names for of_case in paths]
 
         def on_step() -> None:

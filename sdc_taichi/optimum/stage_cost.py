@@ -1,12 +1,13 @@
-"""Least cost of each step by the work that it does, and the largest convex curves below it.
+"""Minimum cost of each step by its executed work, and the largest convex curves below it.
 
-The cost of a step with utilisation u is the least over permitted setpoints of the weighed energy
-of the facility and water. Three estimates lie between the nodes of a table:
+The cost of a step at a utilisation is the minimum over permitted setpoints of the weighted sum of
+facility energy and water. Between the nodes of a table, values are interpolated in three ways:
 
-- of setpoints: the parabola through the best node and its neighbours;
-- of utilisation, where it is given: the cubic through four nodes;
-- of utilisation, where it is free: straight lines between nodes, lowered by the sag h^2*f''/8 of a
-  curve with the second differences of the nodes, so that they lie below the curve.
+- along setpoints: by the parabola through the best node and its neighbours;
+- along utilisation, if the utilisation is known: by the cubic through four nodes;
+- along utilisation, if the plan chooses it: by straight lines between nodes, lowered by
+  h^2*f''/8, the largest distance of a parabola from its chord. Here h is the spacing of the nodes
+  and f'' their second difference quotient. The lowered lines are below the true curve.
 """
 
 from __future__ import annotations
@@ -23,66 +24,66 @@ from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
 _STEPS_AT_ONCE = 512
-"""Steps whose tables are searched at once, so that a year takes little memory."""
+"""Number of steps that are processed together, to limit the memory for a year."""
 
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """The least cost of T steps at each of I amounts of work."""
+    """Minimum cost of each of T steps at each of I amounts of executed work."""
 
     executed_tasks: F64
-    """Amounts of work, rising, in tasks, (I,)."""
+    """Amounts of executed work, increasing, in tasks, (I,)."""
     cost: F64
-    """Least weighed cost over permitted setpoints, (T, I)."""
+    """Minimum weighted cost of all permitted setpoints, (T, I)."""
     facility_kwh: F64
     """Energy of the facility at the cheapest setpoint, in kWh, (T, I)."""
     least_facility_kwh: F64
-    """Least energy of the facility over permitted setpoints, in kWh, (T, I)."""
+    """Minimum energy of the facility at all permitted setpoints, in kWh, (T, I)."""
     most_facility_kwh: F64
-    """Largest energy of the facility over permitted setpoints, in kWh, (T, I)."""
+    """Maximum energy of the facility at all permitted setpoints, in kWh, (T, I)."""
     setpoint_c: F64
-    """The cheapest setpoint, in C, (T, I)."""
+    """Cheapest permitted setpoint, in C, (T, I)."""
     highest_tasks: F64
-    """Most work for which a permitted setpoint exists, in tasks, (T,)."""
+    """Maximum work for which a permitted setpoint exists, in tasks, (T,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadCurves:
-    """Cost and energy of T steps as convex piecewise linear functions of the work that they do.
+    """Cost and energy of T steps as convex piecewise linear functions of the executed work.
 
-    Both are a value at the least amount of work and the sum over M segments of their slope times
-    how much of them is used; slopes of a step rise.
+    The T curves consist of M segments in total. A curve is its value at the minimum work plus, for
+    each segment, the slope times the used part of the segment. Slopes increase along a curve.
     """
 
     least_tasks: F64
-    """Least amount of work, in tasks, (T,)."""
+    """Minimum executed work, in tasks, (T,)."""
     base_cost: F64
-    """Cost of the least amount, (T,)."""
+    """Cost at the minimum work, (T,)."""
     base_kwh: F64
-    """Energy of the facility at the least amount, in kWh, (T,)."""
+    """Energy of the facility at the minimum work, in kWh, (T,)."""
     step: np.ndarray[tuple[int], np.dtype[np.int64]]
-    """Step of each segment, (M,)."""
+    """Number of the step to which each segment belongs, (M,)."""
     width_tasks: F64
     """Length of each segment, in tasks, (M,)."""
     slope_cost: F64
-    """Cost of a task of each segment, (M,)."""
+    """Cost per task in each segment, (M,)."""
     slope_kwh: F64
-    """Energy of a task of each segment, in kWh, (M,)."""
+    """Energy per task in each segment, in kWh, (M,)."""
 
 
 def stage_cost(problem: Problem, *, warm_up_share: float = 0.0) -> StageCost:
-    """The least cost of each step at each utilisation of the table.
+    """Compute the minimum cost of each step at each utilisation of the table.
 
-    A setpoint is permitted where it leaves no heat in the room, and where the hottest inlet is
-    within its limit, with a tolerance of ``INLET_MARGIN_K``, if that is so at any setpoint. Without
-    the agent of cooling the setpoint is that of idle commands.
+    A permitted setpoint removes all heat from the room. Its hottest inlet is within the limit, with
+    a tolerance of ``INLET_MARGIN_K``; this second condition is dropped if no setpoint satisfies it.
+    If the plan does not control cooling, the setpoint is that of idle commands.
 
     Args:
         problem: The planning problem.
-        warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
+        warm_up_share: Weight of steps before the first scored step, relative to the mean weight.
 
     Raises:
-        ConfigError: at some step hardly any utilisation can be cooled.
+        ConfigError: In some step, fewer than two utilisations of the table can be cooled.
     """
     weight, litre = step_weights(problem, warm_up_share)
     parts = [
@@ -98,11 +99,11 @@ def stage_cost(problem: Problem, *, warm_up_share: float = 0.0) -> StageCost:
 
 
 def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64]:
-    """Weights of a kWh bought and of a litre in each step, (T,) each.
+    """Return the weights of a kWh bought and of a litre of water in each step, (T,) each.
 
     Args:
         problem: The planning problem.
-        warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
+        warm_up_share: Weight of steps before the first scored step, relative to the mean weight.
     """
     weight, first = problem.kwh_weight.copy(), problem.scored_from
     litre = np.full(problem.steps, problem.litre_weight)
@@ -112,11 +113,11 @@ def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64
 
 
 def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
-    """The largest convex curves below cost and least energy, from the least to the most work.
+    """Compute the largest convex curves below cost and minimum energy by executed work.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
+        stage: Minimum cost and energy of each step.
     """
     least, most = work_limits(problem)
     most = np.maximum(np.minimum(most, stage.highest_tasks), least)
@@ -150,11 +151,11 @@ def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
 
 
 def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
-    """Curves of a single point: the work that idle commands do.
+    """Return curves that consist of a single point, the work executed under idle commands.
 
     Args:
         problem: The planning problem.
-        stage: Least cost of its steps.
+        stage: Minimum cost and energy of each step.
     """
     tasks, none = problem.work.idle_tasks, np.zeros(0)
     return LoadCurves(
@@ -169,10 +170,11 @@ def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
 
 
 def work_limits(problem: Problem) -> tuple[F64, F64]:
-    """Least and most work that each step can do, in tasks, (T,) each.
+    """Return the minimum and the maximum work that each step can execute, in tasks, (T,) each.
 
-    What may not be deferred runs at once. With ``tasks``, a drain takes no more than the flexible
-    work of the step, and due work is at most what was deferred a deadline earlier.
+    Arriving work that may not be deferred is executed at once. In workload model ``tasks``, a step
+    drains at most its own amount of flexible work from the queue, in addition to due work. Due work
+    is at most the work deferred one deadline earlier.
     """
     work = problem.work
     least = work.arrived_tasks - work.most_deferred_tasks
@@ -189,7 +191,12 @@ def work_limits(problem: Problem) -> tuple[F64, F64]:
 def _of_steps(
     problem: Problem, steps: slice, weight: F64, litre: F64
 ) -> tuple[F64, F64, F64, F64, F64]:
-    """Cost, energy, least and largest energy, and setpoint of some steps, each (t, I)."""
+    """Compute the arrays of ``StageCost`` for some of the steps, (t, I) each.
+
+    Returns:
+        Minimum cost, energy at the cheapest setpoint, minimum and maximum energy, and the cheapest
+        setpoint.
+    """
     table = problem.table
     kwh, water_l = table.facility_kwh[steps], table.water_l[steps]
     cooled = table.unmet_w[steps] == 0.0
@@ -203,7 +210,7 @@ def _of_steps(
         cost = np.where(np.isfinite(energy), cost, np.inf)
         return cost, energy, energy, energy, np.broadcast_to(idle_c[:, None], cost.shape)
     permitted, inlet_c = cooled, table.inlet_max_c[steps]
-    # No run that counts as keeping the limit has a setpoint that is not permitted here.
+    # The margin ensures that every run that satisfies the limit uses only permitted setpoints.
     limit_c = problem.inlet_limit_c + INLET_MARGIN_K
     if np.isfinite(limit_c):
         surely = cooled & (inlet_c <= problem.inlet_limit_c - INLET_MARGIN_K)
@@ -222,9 +229,10 @@ def _of_steps(
 
 
 def _edges(permitted: Mask, cooled: Mask, inlet_c: F64, limit_c: float) -> F64:
-    """Share of the way to the next setpoint at which the inlet reaches its limit, (t, I, J - 1).
+    """Return where between two adjacent setpoints the inlet reaches its limit, (t, I, J - 1).
 
-    It is nan where two neighbours are both permitted or both not.
+    The position is 0 at the lower and 1 at the higher setpoint. It is nan if both setpoints are
+    permitted, or neither is.
     """
     share = np.full(permitted[..., 1:].shape, np.nan)
     if not np.isfinite(limit_c):
@@ -237,7 +245,17 @@ def _edges(permitted: Mask, cooled: Mask, inlet_c: F64, limit_c: float) -> F64:
 
 
 def _least(values: F64, permitted: Mask, edge: F64, setpoint_c: F64) -> tuple[F64, F64]:
-    """The least value over setpoints between and at the nodes, and where it is, (t, I) each."""
+    """Minimise values over permitted setpoints, at and between the nodes.
+
+    Args:
+        values: Values at the nodes, (t, I, J).
+        permitted: True for permitted setpoints, (t, I, J).
+        edge: Position between two nodes at which the inlet reaches its limit, (t, I, J - 1).
+        setpoint_c: Setpoints of the nodes, in C, (J,).
+
+    Returns:
+        The minimum, and the setpoint of the minimum in C, (t, I) each.
+    """
     best = np.where(permitted, values, np.inf)
     j = best.argmin(axis=2)[..., None]
     least = np.take_along_axis(best, j, axis=2)[..., 0]
@@ -270,13 +288,19 @@ def _least(values: F64, permitted: Mask, edge: F64, setpoint_c: F64) -> tuple[F6
 
 
 def _extend(problem: Problem, tasks: F64, t: int, rows: tuple[F64, ...]) -> float:
-    """Continue the values of a step beyond what can be cooled, in place.
+    """Extrapolate the values of step t to work that no setpoint can cool, in place.
 
-    The most work that can be cooled lies between two nodes, so the curve continues to the second in
-    a straight line: a plan may not do that, but no controller can do better.
+    The maximum work that can be cooled is between two nodes, so the curve continues in a straight
+    line to the second node. A plan there may be impossible, but no controller has a lower cost.
+
+    Args:
+        problem: The planning problem.
+        tasks: Amounts of executed work, in tasks, (I,).
+        t: Number of the step.
+        rows: Arrays of ``StageCost``, (T, I) each, the cost first.
 
     Returns:
-        The highest amount of work that is permitted, in tasks.
+        The maximum work that plans may choose, in tasks.
     """
     known = np.flatnonzero(np.isfinite(rows[0][t]))
     if len(known) < 2:
@@ -298,9 +322,17 @@ def _extend(problem: Problem, tasks: F64, t: int, rows: tuple[F64, ...]) -> floa
 
 
 def _lowered(nodes: F64, values: F64, least: F64, most: F64) -> F64:
-    """Values at the least amount, at nodes within the limits, and at the most, (T, I + 2).
+    """Return lowered values whose chords are below the true curve, (T, I + 2).
 
-    They are lowered by the largest sag of the curve beside each node.
+    The columns are the values at the minimum work, at the nodes, and at the maximum work. Each
+    value is lowered by the largest distance of the curve from its chord in the two adjacent
+    intervals.
+
+    Args:
+        nodes: Amounts of work, in tasks, (I,).
+        values: Values at the nodes, (T, I).
+        least: Minimum work of each step, in tasks, (T,).
+        most: Maximum work of each step, in tasks, (T,).
     """
     gap = np.diff(nodes)
     slope = np.diff(values, axis=1) / gap
@@ -322,15 +354,15 @@ def _lowered(nodes: F64, values: F64, least: F64, most: F64) -> F64:
 
 
 def _corners(x: F64, y: F64) -> Mask:
-    """Which points are corners of the largest convex curve below all points of a row, (T, N).
+    """Find the vertices of the lower convex hull of the points in each row, (T, N).
 
-    Of points at the same place only one can be a corner. This is the monotone chain of A. M.
+    Among points with equal x at most one is a vertex. The algorithm is the monotone chain of A. M.
     Andrew, "Another efficient algorithm for convex hulls in two dimensions", Information Processing
-    Letters 9 (1979), for all rows at once.
+    Letters 9 (1979), applied to all rows at once.
 
     Args:
-        x: Places of the points, which do not fall along a row, (T, N).
-        y: Their values, (T, N).
+        x: First coordinates of the points, not decreasing along a row, (T, N).
+        y: Second coordinates of the points, (T, N).
     """
     rows = np.arange(len(x))
     chain = np.zeros(x.shape, np.int64)
@@ -350,13 +382,13 @@ def _corners(x: F64, y: F64) -> Mask:
         length += new
     corner = np.zeros(x.shape, bool)
     for k in range(int(length.max())):
-        kept = k < length
-        corner[rows[kept], chain[kept, k]] = True
+        has_vertex = k < length
+        corner[rows[has_vertex], chain[has_vertex, k]] = True
     return corner
 
 
 def _below(x: F64, y: F64, corner: Mask) -> F64:
-    """Values of the convex curves through corners at all places, (T, N)."""
+    """Interpolate the convex curves through the hull vertices at all x, (T, N)."""
     below = np.empty(y.shape)
     for t in range(len(y)):
         below[t] = np.interp(x[t], x[t, corner[t]], y[t, corner[t]])

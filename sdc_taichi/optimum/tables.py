@@ -1,4 +1,4 @@
-"""Tables of energy, water and inlets by utilisation and setpoint, made by the simulator itself."""
+"""Tables of energy, water and inlets by utilisation and setpoint, computed by the simulator."""
 
 from __future__ import annotations
 
@@ -21,72 +21,72 @@ from sdc_taichi.types import F64, I64
 
 @dataclass(frozen=True, slots=True)
 class FacilityTable:
-    """Results of a step by utilisation and setpoint: T steps, I utilisations, J setpoints.
+    """Results of each of T steps by I utilisations and J setpoints.
 
-    Values are those of the simulator at constant utilisation and setpoint in the weather of each
-    step. Between utilisations they are read linearly.
+    Values are results of the simulator at constant utilisation and setpoint, in the weather of the
+    step.
     """
 
     utilisation: F64
-    """Utilisations, rising from 0 to 1, (I,)."""
+    """Utilisations, increasing from 0 to 1, (I,)."""
     setpoint_c: F64
-    """Setpoints, rising in equal steps, in C, (J,)."""
+    """Setpoints, increasing in equal steps, in C, (J,)."""
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (T, I, J)."""
     water_l: F64
     """Make-up water, in l, (T, I, J)."""
     inlet_max_c: F64
-    """Hottest inlet of a server, in C, (T, I, J)."""
+    """Highest inlet temperature of all servers, in C, (T, I, J)."""
     unmet_w: F64
-    """Cooling load that stays in the room, in W, (T, I, J); inf where racks would throttle or
-    results are beyond what is physical."""
+    """Heat that the cooling does not remove from the room, in W, (T, I, J); inf if racks would
+    throttle or results are not physical."""
 
 
 MOST_COPIES = 4096
-"""Copies of data centers in a batch, beyond which its arrays leave the caches."""
+"""Maximum number of data-center copies in a batch; larger arrays exceed the processor's caches."""
 MOST_RACKS = 2**18
-"""Racks of the copies in a batch, which take some 1 kB each."""
+"""Maximum number of racks in a batch; a rack needs about 1 kB of memory."""
 UTILISATIONS = (41, 81, 161)
-"""Numbers of utilisations that a table may have where none is given; each halves the spacing."""
+"""Candidate numbers of utilisations of a table; each halves the spacing of the previous one."""
 MOST_ERROR = 1e-4
-"""Mean relative error of the energy midway between utilisations up to which a table counts as fine
-enough."""
+"""Maximum mean relative error of the interpolated energy midway between utilisations. A table with
+a larger error receives more utilisations."""
 _LEAST_USUAL = 0.15
-"""Utilisation below which errors are not counted: work rarely falls so low, and power bends most
-where fans leave their lowest speed."""
+"""Utilisation below which interpolation errors are ignored. Such low utilisations are rare, and the
+energy curve bends sharply where fans leave their minimum speed."""
 _SAMPLES = 6
-"""Steps of a run whose weather is tried."""
+"""Number of steps of a run whose weather serves to choose the number of utilisations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """Where the table of one data center has its nodes."""
+    """Utilisations and setpoints of the table of one data center."""
 
     dc: int
-    """Number of the data center in its fleet."""
+    """Index of the data center in its fleet."""
     utilisation: F64
-    """Utilisations, rising, 0..1, (I,)."""
+    """Utilisations, increasing, 0..1, (I,)."""
     setpoint_c: F64
-    """Setpoints, rising, in C, (J,)."""
+    """Setpoints, increasing, in C, (J,)."""
 
     @property
     def copies(self) -> int:
-        """Number of copies of the data center, one for each node."""
+        """Number of simulated copies of the data center, one per pair of node values, I * J."""
         return len(self.utilisation) * len(self.setpoint_c)
 
 
 OnStep = Callable[[int, int], None]
-"""Progress callback ``(done, total)`` in steps of data centers; an error that it raises ends the
-work."""
+"""Progress callback ``(done, total)``, counted in steps times data centers. An error that it raises
+ends the work."""
 
 
 def setpoints_c(config: DataCenterConfig, step_k: float | None = None) -> F64:
-    """Setpoints of tables from the lowest to the highest of a data center, in C, (J,).
+    """Return the setpoints of a table, from minimum to maximum of the data center, in C, (J,).
 
     Args:
-        config: The data center.
-        step_k: Largest distance of setpoints, in K; None is 0.5 K with a tower, and half of that
-            for plants without, whose energy bends more along the setpoint.
+        config: Config of the data center.
+        step_k: Maximum spacing of setpoints, in K. None means 0.5 K for plants with a tower and
+            0.25 K for all others, whose energy curve along the setpoint bends more sharply.
     """
     setpoint = config.hvac.setpoint
     if step_k is None:
@@ -106,28 +106,28 @@ def facility_tables(
     precision: Precision = "f32",
     on_step: OnStep | None = None,
 ) -> list[FacilityTable]:
-    """Tables of data centers over the steps of a run.
+    """Compute the tables of B data centers for the T steps of a run.
 
-    Utilisation and setpoint are constant in each entry, and the room holds no heat from earlier
-    steps. Entries in which racks would throttle, or results are not physical, have an unmet load of
-    inf. Data centers that are alike share one table.
+    Each entry is a steady state at constant utilisation and setpoint, so the room contains no heat
+    of earlier steps. The unmet load is inf for entries in which racks would throttle or results are
+    not physical. Equal data centers share one table.
 
     Args:
-        fleet: B data centers. Events, thermal mass and protection are left out.
-        drivers: Their inputs, whose design temperatures size the devices.
+        fleet: B data centers. Events, thermal mass and protection are ignored.
+        drivers: Inputs of the data centers. Their design temperatures determine device sizes.
         start: First step of each data center, counted from the beginning of the year, (B,).
         steps: Number of steps, T.
-        utilisations: Number of utilisations, evenly from 0 to 1; None is the least of
-            ``UTILISATIONS`` that is fine enough for the hall, see ``MOST_ERROR``.
-        setpoint_step_k: Largest distance of setpoints, as of ``setpoints_c``.
-        precision: Of the server kernels.
+        utilisations: Number of utilisations, equally spaced from 0 to 1. None means the smallest
+            entry of ``UTILISATIONS`` with an error of at most ``MOST_ERROR``.
+        setpoint_step_k: Maximum spacing of setpoints, in K; see ``setpoints_c``.
+        precision: Floating-point precision of the server kernels.
         on_step: Called after every step of a batch of data centers.
 
     Returns:
         A table for each data center, B.
 
     Raises:
-        PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
+        PhysicalLimitError: A hall has no steady air state at some utilisation and setpoint.
     """
     known: dict[Hashable, int] = {}
     table_of = [
@@ -154,7 +154,7 @@ def facility_tables(
                 on_step(before + size * step, len(distinct) * steps)
 
         of_batch = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, tell)
-        tables |= {own.dc: table for own, table in zip(batch, of_batch, strict=True)}
+        tables |= {node.dc: table for node, table in zip(batch, of_batch, strict=True)}
     return [tables[dc] for dc in table_of]
 
 
@@ -167,19 +167,19 @@ def tabulate(
     precision: Precision,
     on_step: Callable[[int], None] | None = None,
 ) -> list[FacilityTable]:
-    """Tables of some data centers over given weather, in one batch.
+    """Compute the tables of n data centers for T steps of given weather, in one batch.
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs, of which the design temperatures are read.
-        nodes: Nodes of n of them.
+        drivers: Inputs of the B data centers; only their design temperatures are used.
+        nodes: Utilisations and setpoints of n of the B data centers.
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
-        precision: Of the server kernels.
-        on_step: Called after every step with the number of those done.
+        precision: Floating-point precision of the server kernels.
+        on_step: Called after every step with the number of finished steps.
 
     Returns:
-        A table for each, n.
+        A table for each of the n data centers.
     """
     place = np.repeat(np.arange(len(nodes)), [each.copies for each in nodes])
     of = np.array([each.dc for each in nodes])[place]
@@ -208,11 +208,11 @@ def tabulate(
 
 
 def batches(fleet: Fleet, nodes: Sequence[Nodes]) -> Iterator[list[Nodes]]:
-    """Parts of a list of nodes whose copies make one batch.
+    """Divide data centers into batches of at most ``MOST_COPIES`` copies and ``MOST_RACKS`` racks.
 
     Args:
         fleet: B data centers.
-        nodes: Nodes of some of them.
+        nodes: Utilisations and setpoints of some of the data centers.
     """
     racks = np.diff(fleet.rack_offsets)
     part: list[Nodes] = []
@@ -230,12 +230,12 @@ def batches(fleet: Fleet, nodes: Sequence[Nodes]) -> Iterator[list[Nodes]]:
 
 
 def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
-    """Values that decide the energy of a facility, besides weather, load and setpoint.
+    """Return all values, except weather, load and setpoint, on which a facility's energy depends.
 
     Args:
         fleet: B data centers.
-        drivers: Their inputs.
-        dc: One of them.
+        drivers: Inputs of the data centers.
+        dc: Index of the data center.
     """
     config = fleet.configs[dc]
     setpoint = config.hvac.setpoint
@@ -254,7 +254,7 @@ def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
 
 
 def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashable:
-    """Values that decide a table besides its number of steps: facility, weather, first step."""
+    """Return all values, except the number of steps, on which a data center's table depends."""
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
@@ -268,10 +268,10 @@ def _fine_enough(
     steps: int,
     precision: Precision,
 ) -> list[int]:
-    """Numbers of utilisations at which the tables of some data centers are fine enough.
+    """Choose the smallest sufficient number of utilisations for the table of each data center.
 
-    What lies midway between nodes is read by the cubic through four of them, and held against the
-    simulator at the lowest and the highest setpoint, in a few steps of the run.
+    The energy midway between nodes, interpolated by the cubic through four nodes, is compared with
+    the simulator. The comparison uses the lowest and the highest setpoint in a few steps.
     """
     finest = np.linspace(0.0, 1.0, UTILISATIONS[-1])
     nodes = [
@@ -298,12 +298,12 @@ def _fine_enough(
 
 
 def _error_midway(utilisation: F64, kwh: F64, spacing: int) -> float:
-    """Mean relative error of the energy midway between nodes.
+    """Return the mean relative error of the energy interpolated midway between nodes.
 
     Args:
-        utilisation: Utilisations, (I,).
-        kwh: Energy, (T, I, J).
-        spacing: Number of utilisations from one node to the next, even.
+        utilisation: Finest utilisations, (I,).
+        kwh: Simulated energy at the finest utilisations, (T, I, J).
+        spacing: Even number of finest utilisations from one node of the table to the next.
     """
     node = kwh[:, ::spacing]
     midway = (9.0 * (node[:, 1:-2] + node[:, 2:-1]) - node[:, :-3] - node[:, 3:]) / 16.0
@@ -313,7 +313,7 @@ def _error_midway(utilisation: F64, kwh: F64, spacing: int) -> float:
 
 
 def _series_of(series: FleetSeries, nodes: Sequence[Nodes], start: I64, steps: int) -> F64:
-    """Values of some data centers over the steps of a run, (n, T)."""
+    """Return the values of a series for n data centers in the T steps of a run, (n, T)."""
     which = np.array([each.dc for each in nodes])
     index = np.asarray(start)[which, None] + np.arange(steps)
     return series.values.take(series.offsets[which, None] + index % series.lengths[which, None])
@@ -327,19 +327,23 @@ def _through_weather(
     throttles: Mask,
     on_step: Callable[[int], None] | None,
 ) -> dict[str, F64]:
-    """Energy, water and unmet load of copies, (T, B) each or (1, B), by their names in a table.
+    """Simulate B copies of data centers in the weather of each of T steps.
 
     Args:
         facility: B copies of data centers.
-        place: Row of the weather that each copy has, (B,).
+        place: Row of the weather for each copy, (B,).
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
-        throttles: Whether racks of each copy would throttle, (B,).
-        on_step: Called after every step with the number of those done.
+        throttles: True for copies whose racks would throttle, (B,).
+        on_step: Called after every step with the number of finished steps.
+
+    Returns:
+        Energy, water and unmet load by name of the field of ``FacilityTable``, (T, B) each. The
+        unmet load is (1, B) if it is the same in all steps.
     """
     copies, steps = len(place), outdoor_c.shape[1]
     facility_kwh, water_l = (np.empty((steps, copies)) for _ in range(2))
-    # Mostly all heat is removed, and one row stands for all steps.
+    # Usually all heat is removed in all steps; a single row of zeros then represents all of them.
     unmet_w = np.zeros((1, copies))
     for step in range(steps):
         result = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
@@ -355,7 +359,7 @@ def _through_weather(
 
 
 def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
-    """Whether racks of each copy would throttle by their hottest inlet or outlet, (B,)."""
+    """Return True for copies whose hottest inlet or outlet would throttle racks, (B,)."""
     limits = [fleet.configs[dc].protection for dc in of]
     inlet_c, outlet_c = (np.full(len(of), np.inf) for _ in range(2))
     for copy, protection in enumerate(limits):
@@ -369,24 +373,24 @@ def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
 
 
 def _of_one(values: F64, first: int, steps: int, nodes: Nodes) -> F64:
-    """Values of one data center, (T, I, J), from those of all copies, (T, B) or (1, B)."""
-    own = np.ascontiguousarray(values[:, first : first + nodes.copies])
+    """Extract the values of one data center, (T, I, J), from those of all copies, (T or 1, B)."""
+    of_dc = np.ascontiguousarray(values[:, first : first + nodes.copies])
     shape = len(nodes.utilisation), len(nodes.setpoint_c)
-    return np.broadcast_to(own.reshape(-1, *shape), (steps, *shape))
+    return np.broadcast_to(of_dc.reshape(-1, *shape), (steps, *shape))
 
 
 INLET_MARGIN_K = 0.02
-"""Distance by which paths stay below the limit of inlets and bounds go beyond it, in K, since
-inlets are not quite linear between the utilisations of a table."""
+"""Margin of inlet limits, in K: plans stay below the limit by this margin, and bounds may exceed it
+by this margin. It covers the error of linear interpolation of inlets between utilisations."""
 
 
 def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
-    """Values of a table at a utilisation of each step, linear between the nodes, (T, J).
+    """Interpolate a table linearly at a utilisation of each step, (T, J).
 
     Args:
         values: Values by step, utilisation and setpoint, (T, I, J).
-        nodes: Utilisations of the table, rising, (I,).
-        utilisation: Utilisation of each step, (T,); beyond the nodes that of the last node counts.
+        nodes: Utilisations of the table, increasing, (I,).
+        utilisation: Utilisation of each step, (T,), clipped to the range of the nodes.
     """
     low, share = _place(nodes, utilisation)
     step = np.arange(len(utilisation))
@@ -394,24 +398,24 @@ def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
 
 
 def energy_at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
-    """Energy of a table at a utilisation of each step, cubic between the nodes, (T, J).
+    """Interpolate the energy of a table by cubics at a utilisation of each step, in kWh, (T, J).
 
     Args:
         values: Energy by step, utilisation and setpoint, in kWh, (T, I, J).
-        nodes: Utilisations of the table, rising, (I,).
-        utilisation: Utilisation of each step, (T,); beyond the nodes that of the last node counts.
+        nodes: Utilisations of the table, increasing, (I,).
+        utilisation: Utilisation of each step, (T,), clipped to the range of the nodes.
     """
     columns = [cubic(nodes, values[:, :, j], utilisation) for j in range(values.shape[2])]
     return np.stack(columns, axis=1)
 
 
 def cubic(nodes: F64, values: F64, at: F64) -> F64:
-    """Values of each step from the cubic through four nodes, (T,).
+    """Interpolate the values of each step by the cubic through the four nearest nodes, (T,).
 
     Args:
-        nodes: Places of the nodes, rising, (I,).
-        values: Values of each step at them, (T, I).
-        at: Place of each step, (T,); beyond the nodes that of the last node counts.
+        nodes: Positions of the nodes, increasing, (I,).
+        values: Values of each step at the nodes, (T, I).
+        at: Position in each step, (T,), clipped to the range of the nodes.
     """
     at = np.clip(at, nodes[0], nodes[-1])
     points = min(4, len(nodes))
@@ -427,13 +431,13 @@ def cubic(nodes: F64, values: F64, at: F64) -> F64:
 
 
 def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
-    """Values at setpoints, linear between the nodes, (...).
+    """Interpolate values linearly at setpoints, (...).
 
     Args:
         values: Values by setpoint, (..., J).
-        nodes: Setpoints of the table, rising, in C, (J,).
-        setpoint_c: Setpoints, in C, of a shape that broadcasts to (...); beyond the nodes that of
-            the last node counts.
+        nodes: Setpoints of the table, increasing, in C, (J,).
+        setpoint_c: Setpoints, in C, of a shape that broadcasts to (...), clipped to the range of
+            the nodes.
     """
     if len(nodes) == 1:
         return values[..., 0].copy()
@@ -445,7 +449,7 @@ def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
 
 
 def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64:
-    """Energy of the facility in each step, in kWh, (T,).
+    """Interpolate the energy of the facility in each step from a table, in kWh, (T,).
 
     Args:
         table: Table of the steps.
@@ -457,43 +461,46 @@ def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64
 
 
 def barred(inlet_max_c: F64, unmet_w: F64, limit_c: float) -> Mask:
-    """Whether a plan may not use a setpoint, (..., J).
+    """Return True for setpoints that a plan must not use, (..., J).
 
-    Where no setpoint keeps inlets within the limit, those with the coolest inlets may be used, and
-    where none meets the cooling load, those that miss the least of it.
+    If no setpoint meets the cooling load, setpoints with the smallest unmet load are allowed. If no
+    setpoint satisfies the inlet limit, setpoints with the coolest inlets are allowed.
 
     Args:
         inlet_max_c: Hottest inlet by setpoint, in C, (..., J).
-        unmet_w: Cooling load that stays in the room by setpoint, in W, (..., J).
-        limit_c: Highest inlet, in C; inf without a limit.
+        unmet_w: Unmet cooling load by setpoint, in W, (..., J).
+        limit_c: Limit of inlet temperatures, in C; inf without a limit.
     """
     within = inlet_max_c <= np.maximum(limit_c, coolest_inlet_c(inlet_max_c, unmet_w))
     return np.asarray(~(_meets(unmet_w) & within))
 
 
 def coolest_inlet_c(inlet_max_c: F64, unmet_w: F64) -> F64:
-    """Least of the hottest inlets over setpoints that miss the least of the cooling load, (..., 1).
+    """Return the coolest hottest inlet among setpoints with the smallest unmet load, (..., 1).
 
     Args:
         inlet_max_c: Hottest inlet by setpoint, in C, (..., J).
-        unmet_w: Cooling load that stays in the room by setpoint, in W, (..., J).
+        unmet_w: Unmet cooling load by setpoint, in W, (..., J).
     """
     return np.asarray(np.where(_meets(unmet_w), inlet_max_c, np.inf).min(axis=-1, keepdims=True))
 
 
 def _meets(unmet_w: F64) -> Mask:
-    """Setpoints that miss the least of the cooling load, (..., J)."""
+    """Return True for the setpoints with the smallest unmet cooling load, (..., J)."""
     return np.asarray(unmet_w <= unmet_w.min(axis=-1, keepdims=True))
 
 
 def _between(low: F64, high: F64, share: F64) -> F64:
-    """Values part of the way from low to high ones, of which one that is not reached may be inf."""
+    """Interpolate between low and high values by a share of 0..1.
+
+    An infinite value has no effect if its weight is 0.
+    """
     below, above = np.where(share < 1.0, low, 0.0), np.where(share > 0.0, high, 0.0)
     return np.asarray(below * (1.0 - share) + above * share)
 
 
 def _place(nodes: F64, at: F64) -> tuple[I64, F64]:
-    """Node below each place, and how far it is to the node above, 0..1."""
+    """Return the index of the node below each position, and the fraction to the next node, 0..1."""
     low = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
     share = (at - nodes[low]) / (nodes[low + 1] - nodes[low])
     return low, np.clip(share, 0.0, 1.0)

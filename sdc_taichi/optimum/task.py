@@ -1,4 +1,4 @@
-"""The task of finding optima: data centers with inputs and options, and parts of them."""
+"""Optimisation task: data centers with their inputs and options, and its division into parts."""
 
 from __future__ import annotations
 
@@ -21,43 +21,44 @@ from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.types import I64
 
 MOST_STEPS = 100 * 8760
-"""Most steps of a plan."""
+"""Maximum number of steps of a plan."""
 MOST_TABLE_BYTES = 2**28
-"""Most memory of the tables of data centers that are solved together, in bytes."""
+"""Maximum memory of the tables of data centers that are solved together, in bytes."""
 INLET_LIMITS_C = -50.0, 100.0
-"""Valid limits of inlets, in C."""
+"""Smallest and largest valid limit of inlet temperatures, in C."""
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Task of finding the optima of B data centers with inputs and options."""
+    """Optimisation task: the optima of B data centers with inputs and options."""
 
     fleet: Fleet
-    """The data centers, B."""
+    """The B data centers."""
     drivers: Drivers
-    """Their inputs, with prices."""
+    """Inputs of the data centers, including prices."""
     start: I64
-    """First step of each, counted from the beginning of the year, (B,)."""
+    """First step of each data center, counted from the beginning of the year, (B,)."""
     seed: I64
-    """Seed of the sampled events of each, (B,); 0 where none are sampled."""
+    """Seed of the sampled events of each data center, (B,); 0 without sampled events."""
     steps: int
     """Number of steps, T."""
     objective: Objective
     """Objective that plans minimise."""
     agents: tuple[Agent, ...]
-    """Agents that plans may move."""
+    """Agents that plans may control."""
     scored_from: int
-    """First step that is scored."""
+    """Number of the first scored step."""
     inlet_limit_c: float | None
-    """Highest inlet where there is a choice, in C; None is that of the protection."""
+    """Highest inlet temperature that plans may cause if another setpoint avoids it, in C. None
+    means the limit of ``protection.ashrae_class``."""
     precision: Precision
     """Floating-point precision of the hall kernels."""
 
     def part(self, where: Sequence[int]) -> Task:
-        """The task of some of the data centers.
+        """Return the task of some of the data centers.
 
         Args:
-            where: their numbers.
+            where: indices of the data centers.
         """
         chosen = list(where)
         return replace(
@@ -69,25 +70,25 @@ class Task:
         )
 
     def parts(self, where: Sequence[int]) -> Iterator[list[int]]:
-        """Numbers of data centers whose tables fit into memory together.
+        """Divide data centers into parts whose tables fit into memory; yield the indices of each.
 
         Args:
-            where: numbers of the data centers to divide.
+            where: indices of the data centers to divide.
         """
         part, size = list[int](), 0.0
         for i in where:
             nodes = UTILISATIONS[0] * len(setpoints_c(self.fleet.configs[i]))
-            own = 4.0 * 8.0 * self.steps * nodes
-            if part and size + own > MOST_TABLE_BYTES:
+            table_bytes = 4.0 * 8.0 * self.steps * nodes
+            if part and size + table_bytes > MOST_TABLE_BYTES:
                 yield part
                 part, size = [], 0.0
             part.append(i)
-            size += own
+            size += table_bytes
         if part:
             yield part
 
     def keys(self) -> list[str]:
-        """SHA-256 of everything that decides what is found of each data center, B."""
+        """Return the cache key of each of B data centers: a hash of config, inputs and options."""
         options = {
             "steps": self.steps,
             "objective": str(self.objective),
@@ -107,15 +108,15 @@ class Task:
                 self.drivers.take([i]),
                 self.precision,
             )
-            own = {"start": int(self.start[i]), "seed": int(self.seed[i])}
-            keys.append(key_of(fingerprint, options | own))
+            of_run = {"start": int(self.start[i]), "seed": int(self.seed[i])}
+            keys.append(key_of(fingerprint, options | of_run))
         return keys
 
     def problems(self, on_step: OnStep | None = None) -> list[Problem]:
-        """The planning problem of each data center, B.
+        """Compute the tables and the planning problem of each of B data centers.
 
         Args:
-            on_step: Progress callback of the tables of what steps cost.
+            on_step: Progress callback ``(done, total)`` of the tables.
         """
         tables = facility_tables(
             self.fleet,
@@ -140,20 +141,20 @@ class Task:
 
 
 def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
-    """Seeds of the data centers that sample events, and 0 for the others, (B,).
+    """Set the seeds of data centers without sampled events to 0, (B,).
 
     Args:
         seed: seed of each data center, (B,).
-        fleet: the data centers.
+        fleet: the B data centers.
     """
     return np.where([bool(config.events.sampled) for config in fleet.configs], seed, 0)
 
 
 def checked_start(start: I64 | Sequence[int], size: int) -> I64:
-    """First steps, (B,).
+    """Check the first steps of B data centers and return them as int64, (B,).
 
     Raises:
-        ConfigError: they are not valid.
+        ConfigError: the steps are not valid.
     """
     first = np.asarray(start)
     whole = first.shape == (size,) and first.dtype.kind in "iu"
@@ -166,10 +167,10 @@ def checked_start(start: I64 | Sequence[int], size: int) -> I64:
 
 
 def checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
-    """Agents in the order of ``AGENTS``.
+    """Check names of agents and return them in the order of ``AGENTS``.
 
     Raises:
-        ConfigError: none, one that is unknown, or one that is named twice.
+        ConfigError: there is no name, or a name is unknown or repeated.
     """
     named = (agents,) if isinstance(agents, str) else tuple(agents)
     if not named or len(set(named)) < len(named) or not set(named) <= set(AGENTS):
