@@ -307,8 +307,8 @@ ARGUMENTS = {
     "dc_doubles": _numbers("f64", 2, DC_DOUBLES, "dcs"),
     "unit_state": _numbers("f64", 2, UNIT_STATE, "units"),
     "rack_state": _vectors(2, RACK_STATE, "blocks"),
-    "rack_state_by_4": _vectors(1, lanes=DENSE_LANES),  # the memory of rack_state, in other vectors
-    "rack_state_by_16": _vectors(1, lanes=RUN_LANES),  # the memory of rack_state, in other vectors
+    "rack_state_by_4": _vectors(1, lanes=DENSE_LANES),  # rack_state as vectors of 4 lanes
+    "rack_state_by_16": _vectors(1, lanes=RUN_LANES),  # rack_state as vectors of 16 lanes
     "server_c": _vectors(1),  # server temperatures of transient halls, by block and group
     "server_c_before": _numbers("real", 1),  # group temperatures at step start
     "server_c_after": _numbers("real", 1),  # group temperatures at step end

@@ -101,7 +101,7 @@ def test_a_chiller_is_one_entry_of_the_registry(monkeypatch: pytest.MonkeyPatch)
     for step in day:
         np.testing.assert_allclose(step.chiller_load_w / step.chiller_w, 3.3)
     for override, message in (
-        ("hvac.plant=water_cooled", "any but electric_air_cooled, of_mine"),
+        ("hvac.plant=water_cooled", "any but .*of_mine"),
         ("hvac.chiller.coil_approach_k=12", "valid within 5..15 C"),
         ("hvac.chiller.model=other", "'of_mine'"),
     ):

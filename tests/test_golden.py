@@ -17,7 +17,9 @@ CASES = dict(golden.cases())
 @pytest.mark.parametrize("name", CASES)
 def test_results_keep_their_bits(name: str) -> None:
     digests: dict[str, Any] = CASES[name]()
-    assert digests == GOLDEN["cases"][name]
+    expected = GOLDEN["cases"][name]
+    # A new quantity of a result has no digest in the file.
+    assert {quantity: digests.get(quantity) for quantity in expected} == expected
 
 
 def test_optimum_keeps_its_figures() -> None:

@@ -459,7 +459,7 @@ class Hall:
         first = {
             "status": RUNNING,
             "exchanges_before": exchanges_before,
-            # A sweep reads the exhaust buffer of the other side.
+            # There are two exhaust buffers: a sweep reads the one that the sweep before it wrote.
             "exhaust_side": exchanges_before,
             "sweep": 0,
             "chunks_done": 0,

@@ -237,7 +237,8 @@ def _build_groups(
     np.maximum.at(most, block, groups)
     racks = np.bincount(block, minlength=len(most))
     first_rack = np.cumsum(racks) - racks
-    # Padding and the closing entry have the first group that follows the last rack before them.
+    # Padding lanes and the entry that ends the table hold the index of the group after the last
+    # group of the preceding rack.
     rack = np.minimum(np.arange(LANES), racks[:, None]) + first_rack[:, None]
     first_group = fleet.group_offsets[np.append(rack, fleet.racks)]
     first_row, group_inputs = _build_group_inputs(fleet, places, first_rack, racks, most, dtype)
