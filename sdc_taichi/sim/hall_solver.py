@@ -141,7 +141,7 @@ class HallSums(HallQuantities):
     """Airflow of each CRAC unit, in m3/s, (U,); meaningless with inlet model ``approach``."""
     cubed_flow_m3s: F64
     """Sum over the running CRAC units of full-speed airflow times the step mean of the cubed
-    relative fan speed, in m3/s, (B,)."""
+    relative fan speed, in m3/s, (B,); 0 with inlet model ``approach``."""
     room_j: F64
     """Heat stored in the room at the end of the step, relative to the setpoint, in J, (B,)."""
 
@@ -170,6 +170,7 @@ class Hall:
         self._fleet = fleet
         self._shapes = _condition_shapes(fleet)
         self._recirculates = fleet.air is not None
+        self._no_flow_m3s = np.zeros(fleet.size)
         tables = build_hall_tables(fleet, self._dtype, SLICES_PER_THREAD * threads)
         self._tables, self._places = tables, tables.places
         self._rack, self._unit = tables.rows("rack_inputs"), tables.rows("unit_inputs")
@@ -602,11 +603,17 @@ class Hall:
         self._was_transient = transient
         results = dict(zip(RESULT_NAMES, (*dc_out, *racks), strict=True))
         unit = self._unit_state
-        unit_supply_c = unit["mean_supply_c"] if self._recirculates else results["supply_c"]
+        if self._recirculates:
+            unit_supply_c = unit["mean_supply_c"]
+            cubed_flow_m3s = self._fleet.unit_sums(
+                unit["cubed_speed"] * self._fleet.unit_design_m3s
+            )
+        else:
+            unit_supply_c, cubed_flow_m3s = results["supply_c"], self._no_flow_m3s
         return HallSums(
             unit_supply_c=unit_supply_c.copy(),
             unit_airflow_m3s=unit["flow_m3s"].copy(),
-            cubed_flow_m3s=self._fleet.unit_sums(unit["cubed_speed"] * self._fleet.unit_design_m3s),
+            cubed_flow_m3s=cubed_flow_m3s,
             room_j=self._dc["room_j"].copy(),
             **results,
         )
