@@ -1,4 +1,4 @@
-"""A made-up optimum of a simulator, for tests of what is told of optima: no search is behind it."""
+"""An invented optimum of a simulator, for tests of how optima are reported; nothing is solved."""
 
 from __future__ import annotations
 

@@ -124,8 +124,10 @@ class TracedObject:
     def __getattr__(self, name: str) -> Traced:
         if name not in self.read:
             value = getattr(self._value, name)
-            if np.shape(value) != (self._trace.size,):
-                raise TypeError(f"{name}: only arrays ({self._trace.size},) can be compiled")
+            if not isinstance(value, float | int) and np.shape(value) != (self._trace.size,):
+                raise TypeError(
+                    f"{name}: only numbers and arrays ({self._trace.size},) can be compiled"
+                )
             self.read[name] = self._trace.argument(value)
         return self.read[name]
 

@@ -15,7 +15,6 @@ from sdc_taichi.kernels.arguments import Argument, in_row_order
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.planning_arguments import (
     QUEUE_ARGUMENTS,
-    STEP_ROWS,
     STORE_ARGUMENTS,
 )
 from sdc_taichi.optimum.facility_map import FacilityMap
@@ -67,32 +66,36 @@ class PlanningKernel:
         size: int,
         horizon: int,
         *,
-        of_dc: Mapping[str, F64],
         commands: F64,
         peaks: int,
         table: F64 | None = None,
         facility_kwh: F64 | None = None,
-        **of_each: F64,
+        **of_each: F64 | Mapping[str, F64],
     ) -> tuple[I64, F64]:
         """Run the kernel for all data centers.
 
         Args:
             size: Number of data centers, B.
             horizon: Number of coming steps, H.
-            of_dc: Rows of the argument ``of_dc`` by name, each (B,).
             commands: Candidate commands of steps after the first.
             peaks: Number of candidates for the month's peak power.
             table: Argument ``table`` of the kernel, if the kernel has one.
             facility_kwh: Energy of the facility in each step, kWh, (B, H); None computes it.
-            of_each: Other arguments by name, with the data centers along the first axis.
+            of_each: Other arguments by name, with the data centers along the first axis; of an
+                argument with rows, each row by its name.
 
         Returns:
             Index of the best first command, (B,), and ``facility_kwh``.
         """
         chosen = np.zeros(size, dtype=np.int32)
         kwh = np.zeros((size, horizon)) if facility_kwh is None else facility_kwh
-        by_dc: dict[str, Any] = of_each | {"chosen": chosen, "facility_kwh": kwh}
-        by_dc["of_dc"] = np.stack(in_row_order(self._arguments["of_dc"].rows, of_dc), axis=1)
+        by_dc: dict[str, Any] = {"chosen": chosen, "facility_kwh": kwh}
+        for name, values in of_each.items():
+            if isinstance(values, Mapping):
+                by_row = in_row_order(self._arguments[name].rows, values)
+                by_dc[name] = np.stack(by_row, axis=-1)
+            else:
+                by_dc[name] = values
         shared = {"commands": commands, "peaks": peaks, "horizon": horizon}
         if table is not None:
             shared["table"] = table
@@ -227,7 +230,7 @@ class QueuePlanner:
             peaks=peaks,
             table=self._table,
             of_dc=of_dc,
-            coming=np.stack(in_row_order(STEP_ROWS, coming), axis=2),
+            coming=coming,
             first_executed=now.started_tasks,
             first_waiting=waiting[:, None] + now.deferred_tasks - now.dequeued_tasks,
             first_late=now.dropped_tasks,

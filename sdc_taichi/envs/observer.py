@@ -147,8 +147,7 @@ class Observer:
     def state(self, view: View) -> F32:
         """Return the shared state, which concatenates all features, (B, m).
 
-        Raises:
-            RuntimeStateError: ``reset`` has not been called.
+        ``reset`` must have been called.
         """
         entries, width = self._entries_of(view), self._time_width
         out = np.empty((view.size, width + len(entries.measured)), dtype=np.float32)

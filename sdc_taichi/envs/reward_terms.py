@@ -87,13 +87,13 @@ class TermContext:
     """IT energy of a task, in kWh; it is 1 % of the IT energy of a step at full load."""
     demand_charge_per_kw: F64
     """Price per kW of the highest power of a billing period."""
-    bills: F64
+    bills: float
     """Length of the episode divided by the 30 days of a billing period."""
     peak_kw: F64
     """Highest power of the episode before this step, at least half of the design power, in kW."""
 
     def __init__(self, bills: float) -> None:
-        self._bills = bills
+        self.bills = bills
         self._index: I64 = np.zeros(0, dtype=np.int64)
         # Pairs of a series and its forward mean, by the name of the series.
         self._means: dict[str, tuple[FleetSeries, FleetSeries]] = {}
@@ -110,7 +110,6 @@ class TermContext:
         self.design_kwh = view.sizing.facility_w * view.step_h / 1e3
         self.task_kwh = view.sizing.it_w * view.step_h / (1e3 * TASKS_PER_STEP)
         self.demand_charge_per_kw = view.fleet.values("tariff.demand_charge_per_kw")
-        self.bills = np.full(view.size, self._bills)
 
     def begin_step(self, step: int, peak_kw: F64) -> None:
         """Set the current step, to which all other attributes then refer.

@@ -117,7 +117,6 @@ class Rewards:
         self._context = TermContext(days / BILL_DAYS)
         # Highest billed power before and after the last step, in kW, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
-        self._step_h = 0.0
 
     def reset(self, view: View) -> None:
         """Start an episode.
@@ -130,7 +129,6 @@ class Rewards:
                 scaled by its range.
         """
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
-        self._step_h = view.step_h
         self._context.reset(view)
         if self._released is not None:
             self._released.reset(view)
@@ -189,7 +187,6 @@ class Rewards:
 
         ``CompiledStage`` traces this function.
         """
-        result = _WithStep(result, self._step_h)
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
         individual = [_weighed(terms, self._scales[agent]) for agent in AGENTS]
         by_agent, joint = _with_sum(self._shared(individual))
@@ -202,16 +199,6 @@ class Rewards:
         shared = collaborative_rewards(individual, self._collaboration)
         by_agent = dict(zip(AGENTS, shared, strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
-
-
-class _WithStep:
-    """Result of a step during tracing, with the step's length in h as a plain number."""
-
-    def __init__(self, result: Any, step_h: float) -> None:
-        self._result, self.step_h = result, step_h
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._result, name)
 
 
 def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:

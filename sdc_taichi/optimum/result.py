@@ -180,7 +180,7 @@ def with_tabled_ends(
         optimum: Optimum of the simulator's data centers.
         sim: The simulator.
         progress: Progress callback ``(stage, done, total)``, in data centers.
-        stop: Called before each data center; the work ends if it returns True.
+        stop: Called before each exact bound; the work ends if it returns True.
 
     Returns:
         An optimum with approximate end values, or ``optimum`` itself if a queue has no limit.
@@ -191,16 +191,20 @@ def with_tabled_ends(
     limits = queue_limit_tasks(sim.fleet)
     if np.any(limits >= UNLIMITED_TASKS):
         return optimum
+
+    def bound_of(dc: int, ends: Ends) -> float:
+        if stop is not None and stop():
+            raise StoppedError("values of ends were stopped")
+        return optimum.bound_of_ends(dc, ends)
+
     full_kwh = sim.sizing.battery_kwh * sim.fleet.values("battery.upper_v")
     curves = []
     for dc in range(sim.size):
-        if stop is not None and stop():
-            raise StoppedError("values of ends were stopped")
         if progress is not None:
             progress("values of ends", dc, sim.size)
         most_kwh = float(full_kwh[dc]) if "battery" in optimum.agents else 0.0
         most_tasks = float(limits[dc]) if "load" in optimum.agents else 0.0
-        curves.append(_ends_curve(partial(optimum.bound_of_ends, dc), most_kwh, most_tasks))
+        curves.append(_ends_curve(partial(bound_of, dc), most_kwh, most_tasks))
     return replace(optimum, bound_of_ends=lambda dc, ends: curves[dc](ends))
 
 

@@ -24,7 +24,13 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
-from sdc_taichi.sim.workload import due_entries, due_steps, due_work, queue_limit_tasks
+from sdc_taichi.sim.workload import (
+    due_entries,
+    due_steps,
+    due_work,
+    queue_length,
+    queue_limit_tasks,
+)
 from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 
@@ -154,7 +160,7 @@ class Follower:
             "queue_limit_tasks": queue_limit_tasks(fleet),
         }
         self._work_model, self._battery_model = models["workload"], models["battery"]
-        self._due_steps = due_steps(fleet)
+        self._due_entries = due_entries(queue_length(fleet), due_steps(fleet))
         self._battery = battery_parameters(fleet)
         loses = self._battery_model != "released"
         one = np.ones(fleet.size)
@@ -190,7 +196,7 @@ class Follower:
             model=self._work_model,
             demand=demand,
             waiting_tasks=queue[:, -1],
-            due_tasks=due_work(queue, due_entries(queue.shape[1], self._due_steps)),
+            due_tasks=due_work(queue, self._due_entries),
             **self._work,
         )
         return np.where(moves, command, 0.0)

@@ -135,9 +135,10 @@ def facility_tables(
     ]
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
-    counts = [utilisations or 0] * len(distinct)
     if utilisations is None:
         counts = _fine_enough(fleet, drivers, distinct, start, steps, precision)
+    else:
+        counts = [utilisations] * len(distinct)
     nodes = [
         Nodes(dc, np.linspace(0.0, 1.0, count), setpoints_c(fleet.configs[dc], setpoint_step_k))
         for dc, count in zip(distinct, counts, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -208,14 +208,11 @@ class HottestAir:
 
     Args:
         sim: The simulator.
-        dcs: Indices of the data centers whose air is recorded; None records all.
     """
 
-    def __init__(self, sim: Simulator, dcs: Sequence[int] | None = None) -> None:
+    def __init__(self, sim: Simulator) -> None:
         self._sim = sim
-        # An infinite rank excludes the data centers whose air is not recorded.
-        self._rank = np.full(sim.size, -np.inf if dcs is None else np.inf)
-        self._rank[[] if dcs is None else list(dcs)] = -np.inf
+        self._rank = np.full(sim.size, -np.inf)
         self._step: I64 = np.full(sim.size, -1, dtype=np.int64)
         self._air: IntakeAir | None = None
 

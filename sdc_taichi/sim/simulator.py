@@ -264,20 +264,18 @@ class Simulator:
             like = self._initial_state(np.zeros(self.size, dtype=np.int64), inputs)
         return snapshot.to_state(values, like)
 
-    def continue_from(self, state: State | None, drivers: Drivers | None = None) -> None:
+    def continue_from(self, state: State, drivers: Drivers | None = None) -> None:
         """Continue from a state of this simulator.
 
         Args:
-            state: Return value of ``read_state``, or an earlier value of ``state``; None makes the
-                simulator as it was before the first ``reset``.
+            state: Return value of ``read_state``, or an earlier value of ``state``.
             drivers: New inputs; None keeps the current inputs.
         """
         inputs = self.drivers if drivers is None else self._checked_drivers(drivers)
         self._started().hall.discard_last_step()
         self._state = state
-        if state is not None:
-            self._timeline = self._timeline.reseeded(state.seed)
-            self._drivers = replace(inputs, start=state.start)
+        self._timeline = self._timeline.reseeded(state.seed)
+        self._drivers = replace(inputs, start=state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the current state to an .npz file, atomically and without pickle.

@@ -188,6 +188,16 @@ def due_steps(fleet: Fleet) -> F64:
     return deadline_steps + workload.MODELS[fleet.models["workload"]].due_after_steps
 
 
+def queue_length(fleet: Fleet) -> int:
+    """Return the number L of arrival steps that the queues of a fleet distinguish.
+
+    There are two entries more than steps in the longest age horizon: one for the work that arrives,
+    and one for all older work together.
+    """
+    horizon_steps = np.rint(fleet.values("workload.age_horizon_h") * fleet.steps_per_hour)
+    return int(np.max(horizon_steps)) + 2
+
+
 class Workload:
     """Runs the workload model of a fleet and updates its queues.
 
@@ -209,8 +219,7 @@ class Workload:
             lambda **x: fields_of(model.step(workload.WorkPoint(**x, **limits))), fleet.size
         )
         self._max_utilisation = v("workload.max_utilisation")
-        # Two entries more than the horizon: for arriving work, and for all older work together.
-        self._length = int(np.max(np.rint(v("workload.age_horizon_h") * per_hour))) + 2
+        self._length = queue_length(fleet)
         self._queue = Queue(self._length, due_steps(fleet))
 
     def empty_queue(self) -> F64:
