@@ -22,6 +22,7 @@ from sdc_taichi.sim.step_inputs import UnitIndex
 
 FOUR = "hvac.crac.units=4"
 N_PLUS_1 = "hvac.crac.spare_units=1"
+UNLIMITED = "hvac.crac.unit_sizes=null", "hvac.crac.capacity_kw=null"
 MINUTES = (
     "simulation.thermal=transient",
     "simulation.steps_per_hour=60",
@@ -107,6 +108,43 @@ def test_spare_units_leave_the_design_point_as_it_is(spare_units: int) -> None:
     assert spare.air is not None
     assert plain.air is not None
     assert spare.air.return_c == pytest.approx(plain.air.return_c)
+
+
+@pytest.mark.parametrize("preset", ["corrected", "hall_of_2026"])
+@pytest.mark.parametrize(("units", "spare_units"), [(8, 2), (5, 1), (3, 2)])
+def test_spare_units_make_equal_units_of_which_the_rest_suffice(
+    preset: str, units: int, spare_units: int
+) -> None:
+    crac = [f"hvac.crac.{name}" for name in (f"units={units}", f"spare_units={spare_units}")]
+    fleet = build_fleet(load_config(preset, [*crac, *UNLIMITED]))
+    size_m3s = fleet.design_flow_m3s[0] / (units - spare_units)
+    np.testing.assert_allclose(fleet.unit_design_m3s, size_m3s, rtol=1e-12)
+    assert fleet.air is not None
+    drawn_m3s = fleet.air.rack_need_m3s @ fleet.air.unit_shares.reshape(-1, units)
+    np.testing.assert_allclose(drawn_m3s, drawn_m3s[0], rtol=1e-9)
+
+
+def test_two_spare_units_take_over_for_two_that_are_lost() -> None:
+    two = LOST.replace("]", ", {kind: crac_down, unit: 5, start_h: 0.05, duration_h: 100}]")
+    eight = "hvac.crac.units=8", "hvac.crac.spare_units=2"
+    _, whole = run_at_full_load(*eight, *MINUTES, steps=2)
+    fleet, lost = run_at_full_load(*eight, PROTECTED, *MINUTES, two, steps=60)
+    runs = np.delete(lost[-1].unit_flow_m3s / fleet.unit_design_m3s, [0, 5])
+    np.testing.assert_allclose(runs, runs[0], rtol=0.01)
+    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.5
+    assert all(result.throttled_racks[0] == 0 for result in lost)
+
+
+def test_units_of_either_size_are_chosen_by_name() -> None:
+    def sizes(*overrides: str) -> list[float]:
+        crac = [f"hvac.crac.{override}" for override in overrides]
+        return list(build_fleet(load_config("corrected", crac)).unit_design_m3s)
+
+    by_need = sizes("units=8")
+    assert max(by_need) > 1.1 * min(by_need)
+    assert sizes("units=8", "unit_sizes=equal") == pytest.approx([sum(by_need) / 8] * 8)
+    spare = sizes("units=8", "unit_sizes=by_need", "spare_units=2")
+    assert spare == pytest.approx([size * spare[0] / by_need[0] for size in by_need])
 
 
 @pytest.mark.parametrize("flow_model", ["follow_servers", "constant", "controlled"])

@@ -19,6 +19,7 @@ EVENT = "events.scheduled=[{{kind: {}, start_h: 1, duration_h: 1{}}}]"
         ("hall.height_gradient=1", ["hall.height_gradient", "less than 1"]),
         ("hvac.crac.units=20000", ["hvac.crac.units", "10000", "20000"]),
         ("hvac.crac.spare_units=1", ["spare_units 1 must be below units 1"]),
+        ("hvac.crac={unit_sizes: equal, airflow_m3s: 30}", ["unit_sizes 'equal'"]),
         ("hvac.crac.capacity_kw=[9, 9]", ["capacity_kw has 2 entries, expected 1 (units)"]),
         (
             "hvac.crac.temperature_control=return",

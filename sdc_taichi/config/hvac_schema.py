@@ -117,7 +117,11 @@ class CracConfig(Section):
     airflow alone; if all units run, each runs at part speed."""
     airflow_m3s: UnitAirflow | tuple[UnitAirflow, ...] | None = None
     """Airflow of a unit at full speed, in m3/s: one value for all units, or one per unit; None
-    sizes the units for the need of their racks at the design point."""
+    computes it from the design airflow, see ``unit_sizes``."""
+    unit_sizes: Literal["equal", "by_need"] | None = None
+    """Sizes of the units if ``airflow_m3s`` is None: ``equal``, or each in proportion to the need
+    of its racks at the design point, ``by_need``. None means ``equal`` with spare units, otherwise
+    ``by_need``."""
     unit_shares: tuple[tuple[Share, ...], ...] | None = None
     """Share of each unit in the supply air of each rack, 0..1: one row of shares per rack, and each
     row sums to 1; None computes shares from distances."""
@@ -170,6 +174,11 @@ class CracConfig(Section):
                 f"spare_units {self.spare_units} sizes units, and airflow_m3s gives their size; "
                 "valid is one of the two"
             )
+        if self.unit_sizes is not None and self.airflow_m3s is not None:
+            raise ValueError(
+                f"unit_sizes {self.unit_sizes!r} sizes units, and airflow_m3s gives their size; "
+                "valid is one of the two"
+            )
         for name in ("airflow_m3s", "capacity_kw"):
             values = getattr(self, name)
             if isinstance(values, tuple) and len(values) != self.units:
@@ -178,6 +187,13 @@ class CracConfig(Section):
                     "value for all"
                 )
         return self
+
+    @property
+    def sized_by_need(self) -> bool:
+        """True if each unit is sized for the need of the racks that it supplies."""
+        if self.airflow_m3s is not None or self.unit_sizes == "equal":
+            return False
+        return self.unit_sizes == "by_need" or self.spare_units == 0
 
 
 class ChillerConfig(Section):

@@ -25,9 +25,9 @@ _LEAST_WEIGHT = 1e-12
 def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
     """Return the airflow of each CRAC unit at full speed, in m3/s, (U,).
 
-    If it is not configured, the design airflow is distributed in proportion to the need of the
-    racks for the air of each unit. The result is then scaled up so that the units deliver the
-    design airflow even without the ``spare_units`` largest units.
+    If it is not configured, the design airflow is distributed equally or in proportion to the need
+    of the racks for the air of each unit. The result is then scaled up so that the units deliver
+    the design airflow even without the ``spare_units`` largest units.
 
     Args:
         crac: Configuration of the units.
@@ -36,7 +36,8 @@ def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
     """
     if crac.airflow_m3s is not None:
         return np.broadcast_to(np.asarray(crac.airflow_m3s, np.float64), (crac.units,)).copy()
-    airflow_m3s = np.asarray(design_m3s * need_m3s / need_m3s.sum())
+    size = need_m3s if crac.sized_by_need else np.ones(crac.units)
+    airflow_m3s = np.asarray(design_m3s * size / size.sum())
     if crac.spare_units:
         left_m3s = np.sort(airflow_m3s)[: crac.units - crac.spare_units].sum()
         airflow_m3s = airflow_m3s * (design_m3s / left_m3s)

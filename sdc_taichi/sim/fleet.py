@@ -433,17 +433,15 @@ def _unit_supply(config: DataCenterConfig, recirculation: Recirculation) -> tupl
         )
     if crac.unit_shares is not None:
         shares = np.array(crac.unit_shares)
-        return shares, full_airflow_m3s(
-            crac, shares.T @ recirculation.need_m3s, recirculation.design.crac_flow_m3s
-        )
-    shares = unit_shares(floor_plan(config.hall), crac.units, crac.supply_length_m)
-    airflow_m3s = full_airflow_m3s(
-        crac, shares.T @ recirculation.need_m3s, recirculation.design.crac_flow_m3s
-    )
-    if crac.airflow_m3s is not None:
+    else:
+        shares = unit_shares(floor_plan(config.hall), crac.units, crac.supply_length_m)
+    need_m3s, design_m3s = recirculation.need_m3s, recirculation.design.crac_flow_m3s
+    airflow_m3s = full_airflow_m3s(crac, shares.T @ need_m3s, design_m3s)
+    # Configured shares that come with configured airflows are those of the real units.
+    measured = crac.unit_shares is not None and crac.airflow_m3s is not None
+    if not crac.sized_by_need and not measured:
         # Units with a large airflow supply more of each rack than distance alone suggests.
-        weight = unit_weights(shares, recirculation.need_m3s, airflow_m3s)
-        shares = weighted_shares(shares, weight)
+        shares = weighted_shares(shares, unit_weights(shares, need_m3s, airflow_m3s))
     return shares, airflow_m3s
 
 
