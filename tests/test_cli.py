@@ -330,13 +330,17 @@ def test_a_data_center_is_where_its_weather_is(
     (tmp_path / "hall.yaml").write_text(
         f"extends: tiny\nname: mine\nsite: {{weather_file: {real_files['weather']}}}\n"
     )
-    for given in (["hall.yaml"], ["tiny", "--weather", str(real_files["weather"])]):
-        done = call("simulate", *given, "--days", 1, "--json")
+    weather = ["--weather", str(real_files["weather"])]
+    (tmp_path / "own.yaml").write_text("extends: hall.yaml\nsite: {weather_file: null}\n")
+    named = {"hall.yaml": "mine", "own.yaml": "mine", "tiny": "test-station"}
+    for source, name in named.items():
+        given = [] if source == "hall.yaml" else weather
+        done = call("simulate", source, *given, "--days", 1, "--json")
         assert done.exit_code == 0, done.output
         (dc,) = json.loads(done.stdout)["data_centers"]
-        assert (dc["name"], dc["location"]) == ("test-station", "Test.Station")
-        folder = tmp_path / "runs" / f"{Path(given[0]).stem}-test-station-01-01"
-        assert set(steps_of(folder)["dc"]) == {"test-station"}
+        assert (dc["name"], dc["location"]) == (name, "Test.Station")
+        folder = tmp_path / "runs" / f"{Path(source).stem}-test-station-01-01"
+        assert set(steps_of(folder)["dc"]) == {name}
     assert "site Test.Station" in call("config", "check", "hall.yaml").stdout
     done = call("simulate", "hall.yaml", "--site", "ny,wa", "--days", 1)
     assert done.exit_code == 2

@@ -93,6 +93,67 @@ def test_a_file_extends_a_preset(tmp_path: Path) -> None:
     assert (config.name, config.site.location) == ("mine", "TX")
 
 
+@pytest.mark.parametrize("suffix", ["yaml", "json"])
+def test_a_file_extends_another_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    (tmp_path / "sites").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    hall = "extends: tiny\nname: hall\nhvac: {setpoint: {initial_c: 20, step_k: 0.5}}\n"
+    written(tmp_path / "hall.yaml", hall)
+    text = '{"extends": "../hall.yaml", "name": "dallas", "servers": {"power_w": [[300, 90]]}}'
+    dallas = written(tmp_path / "sites" / f"dallas.{suffix}", text)
+    written(tmp_path / "again.yaml", f"extends: {dallas}\nhvac: {{setpoint: {{step_k: 1}}}}")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    config = load_config(Path("..") / "again.yaml", ["site.start=07-01"])
+    setpoint = config.hvac.setpoint
+    assert (config.name, setpoint.initial_c, setpoint.step_k) == ("dallas", 20, 1)
+    # Servers of one kind replace the inherited groups, as they do those of a preset.
+    assert (config.servers.power_w, config.servers.groups) == (((300, 90),), None)
+    assert load_config(dallas) == load_config(
+        "tiny",
+        [
+            "name=dallas",
+            "hvac.setpoint.initial_c=20",
+            "hvac.setpoint.step_k=0.5",
+            "servers.power_w=[[300, 90]]",
+        ],
+    )
+
+
+def test_a_file_extends_one_of_the_format_of_sustaindc(tmp_path: Path) -> None:
+    written(tmp_path / "dc_config.json", json.dumps(sustaindc_values()))
+    path = written(tmp_path / "mine.yaml", "extends: dc_config.json\nsite: {location: TX}")
+    base = load_config(tmp_path / "dc_config.json")
+    assert load_config(path) == base.model_copy(update={"site": load_config(path).site})
+    assert load_config(path).site.location == "TX"
+
+
+@pytest.mark.parametrize("links", [("a",), ("b", "a"), ("b", "c", "a"), ("b", "c", "b")])
+def test_files_that_extend_themselves_are_refused(tmp_path: Path, links: tuple[str, ...]) -> None:
+    for name, base in zip("abc", links, strict=False):
+        written(tmp_path / f"{name}.yaml", f"extends: ./{base}.yaml\n")
+    with pytest.raises(ConfigError, match="is a cycle") as failed:
+        load_config(tmp_path / "a.yaml")
+    (line,) = str(failed.value).splitlines()
+    names = [Path(text).stem for text in line.split(": ")[2].split(" is a cycle")[0].split(" -> ")]
+    assert names == [*"abc"[: len(links)], links[-1]][-len(set(links)) - 1 :]
+
+
+def test_a_long_chain_of_files_is_refused(tmp_path: Path) -> None:
+    for i in range(1500):
+        written(tmp_path / f"{i}.yaml", f"extends: {i + 1}.yaml\n")
+    with pytest.raises(ConfigError, match="chain of files"):
+        load_config(tmp_path / "0.yaml")
+
+
+def test_a_fault_of_an_extended_file_names_both_files(tmp_path: Path) -> None:
+    written(tmp_path / "base.yaml", "extends: tiny\nhall: {rows: 0}\n")
+    path = written(tmp_path / "mine.yaml", "extends: base.yaml\n")
+    with pytest.raises(ConfigError, match=r"mine\.yaml \(extends .*base\.yaml\): hall\.rows"):
+        load_config(path)
+
+
 def test_configs_are_frozen_and_hashable() -> None:
     config = load_config("tiny")
     with pytest.raises(ValidationError):

@@ -217,6 +217,13 @@ def test_copies_are_dealt_over_the_sites() -> None:
     assert build_fleet(make_configs(TINY, count=3, sites=["ny", "az"])).size == 3
 
 
+def test_copies_of_a_named_data_center_keep_its_name() -> None:
+    base = load_config("tiny", ["name=Dallas 3"])
+    assert [c.name for c in make_configs(base)] == ["Dallas 3"]
+    assert [c.name for c in make_configs(base, count=2)] == ["Dallas 3-0", "Dallas 3-1"]
+    assert [c.name for c in make_configs(base, sites=["ny", "tx"])] == ["ny", "tx"]
+
+
 def test_copies_are_named_after_their_places(tmp_path: Path) -> None:
     header = "LOCATION,{},SP,BRA,T,0,-23.5,-46.6,-3.0,800.0\n"
     places = {"São Paulo (2)": "são-paulo-2", "-": "of-no-city", "": "of-no-city", "..": "unnamed"}

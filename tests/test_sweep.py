@@ -13,7 +13,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from sdc_taichi import Simulator, load_config, make_controller, simulate, with_values
+from sdc_taichi import (
+    Simulator,
+    load_config,
+    make_configs,
+    make_controller,
+    simulate,
+    with_values,
+)
 from sdc_taichi.benchmark.best_value import best_by_month, with_default
 from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.benchmark.jobs import JobResult
@@ -257,9 +264,33 @@ def test_what_would_run_is_shown_and_nothing_written(tmp_path: Path) -> None:
     assert not (tmp_path / "sweep").exists()
 
 
+def test_a_sweep_starts_on_the_day_of_its_option(tmp_path: Path) -> None:
+    rows = []
+    for name, begins in (("by option", ["--start", "07-01"]), ("by field", ["site.start=07-01"])):
+        asked = ["tiny", "--vary", f"{SETPOINT}=18,20", "--days", "0.25", *begins]
+        done = call(*asked, "--out", tmp_path / name)
+        assert done.exit_code == 0, (done.output, done.exception)
+        rows.append(pd.read_parquet(tmp_path / name / "results"))
+    pd.testing.assert_frame_equal(rows[0], rows[1])
+
+
+def test_a_run_keeps_the_name_and_thus_the_events_of_its_data_center() -> None:
+    rule = {"kind": "heat_wave", "offset_k": 9, "per_year": 2000, "duration_h": [1, 3]}
+    base = with_values(TINY, {"name": "mine", "events.sampled": [rule]})
+    found = rows_of(Sweep(base, varied(f"{SETPOINT}=18,20"), days=0.5))
+    config = with_values(base, {SETPOINT: 20.0})
+    for named, is_equal in ((config, True), (config.model_copy(update={"name": "ny"}), False)):
+        with Simulator(make_configs(named)) as sim:
+            totals = simulate(sim, make_controller("idle", sim.fleet), 48, 0)
+            alone = metrics_per_dc(totals, sim.fleet)[0]
+        assert bool(alone["cfp_kg"] == found["cfp_kg"].iloc[-1]) is is_equal
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--months", "1", "--start", "07-01"], "--start 07-01 with --months 1: .* one of the two"),
+        (["--start", "07-32"], "--start: .*07-32"),
         (["--months", "13"], "valid are all, or months 1..12"),
         (["--best", "cfp", "--months", "1"], "did you mean 'cfp_kg'"),
         (["--most", "5", "--months", "1,7"], "8 runs .* as many as --most allows"),

@@ -46,7 +46,7 @@ from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, DAYS_PER_YEAR, whole
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Metric, empty_totals, metrics_per_dc
 from sdc_taichi.sim.fleet import build_fleet, shared_values
-from sdc_taichi.sim.fleet_configs import locations, place_names
+from sdc_taichi.sim.fleet_configs import locations, names_of_runs, place_names
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 
@@ -261,7 +261,8 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
             else:
                 fleets.setdefault(shared_values(config), {})[place] = config
         for configs in fleets.values():
-            names = place_names(list(configs.values()))
+            name_all = place_names if "site.location" in fields else names_of_runs
+            names = name_all(list(configs.values()))
             named = [
                 (place, config.model_copy(update={"name": name}))
                 for (place, config), name in zip(configs.items(), names, strict=True)

@@ -254,12 +254,7 @@ class SiteOptions:
         from sdc_taichi.sim.fleet_configs import make_configs
 
         sites, files = site_names(self.site), self._files()
-        if start is not None:
-            try:
-                day_of_year(start)
-            except ValueError as error:
-                raise ConfigError(f"--start: {error}") from None
-            base = _with_site(base, start=start.strip())
+        base = with_start(base, start)
         # Without --site, all data centers use the files given; with it, each site has its own
         # files, which are set below.
         base = _with_site(base, **{field: None if sites else of[0] for field, of in files.items()})
@@ -408,6 +403,21 @@ def site_names(site: str | None) -> list[str]:
                 "(--dcs makes copies)"
             )
     return names
+
+
+def with_start(config: DataCenterConfig, start: str | None) -> DataCenterConfig:
+    """Return a configuration with the first day of ``--start``; None changes nothing.
+
+    Raises:
+        ConfigError: the day is not valid.
+    """
+    if start is None:
+        return config
+    try:
+        day_of_year(start)
+    except ValueError as error:
+        raise ConfigError(f"--start: {error}") from None
+    return _with_site(config, start=start.strip())
 
 
 def _with_site(config: DataCenterConfig, **update: str | None) -> DataCenterConfig:

@@ -15,9 +15,11 @@ from sdc_taichi.cli.options import (
     ForecastRunOptions,
     Quiet,
     Site,
+    Start,
     controllers_option,
     out_option,
     site_names,
+    with_start,
 )
 from sdc_taichi.cli.terminal import EXIT_FAILURE, first_lines, print_notes, print_table
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
@@ -54,6 +56,7 @@ def sweep_command(
         float | None,
         typer.Option(help="Length of each run, in days. [default: the month, or 365]"),
     ] = None,
+    start: Start = None,
     controller: Annotated[
         list[str] | None,
         controllers_option("Controller, as of simulate; repeatable. [default: idle]"),
@@ -96,8 +99,13 @@ def sweep_command(
     from sdc_taichi.benchmark.sweep import check_sweep, sweep_inputs, sweep_jobs
 
     base, label = config.read()
+    if start is not None and months is not None:
+        raise ConfigError(
+            f"--start {start} with --months {months}: a month starts on its first day; valid is "
+            "one of the two"
+        )
     sweep = _sweep(
-        base,
+        with_start(base, start),
         vary or [],
         site,
         most,

@@ -21,6 +21,8 @@ from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 DEFAULT_PRESET = "corrected"
 """Preset that is loaded by default."""
+_MOST_FILES = 20
+"""Largest number of files that extend each other in turn."""
 _REPLACES: dict[str, dict[str, Any]] = {
     "servers.power_w": {"servers.groups": None, "hall.rack_types": {}, "hall.rack_plan": []},
     "servers.groups": {"servers.power_w": None, "hall.rack_types": {}, "hall.rack_plan": []},
@@ -44,9 +46,10 @@ def load_config(
 
     Args:
         source: Name of a preset (see ``preset_names``) or path of a file. A YAML file has the
-            schema of ``DataCenterConfig`` and may name a preset to start from under ``extends``. A
-            file in the SustainDC JSON format starts from preset ``sustaindc``. None means preset
-            ``corrected``.
+            schema of ``DataCenterConfig``. It may start from a preset or from another file, which
+            it names under ``extends``; a relative path begins at the folder of the file that names
+            it. A file in the SustainDC JSON format starts from preset ``sustaindc``. None means
+            preset ``corrected``.
         overrides: ``a.b=c`` assignments, applied last; ``c`` is parsed as YAML.
 
     Raises:
@@ -125,11 +128,11 @@ def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
 
 
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Return label and values of a preset or file, merged with the preset that it extends."""
+    """Return label and values of a preset or file, merged with what it extends."""
     if isinstance(source, str) and source in preset_names():
-        return _read_preset(source)
+        return f"preset {source}", _read_preset(source)
     try:
-        text = read_text(source, MOST_CONFIG_BYTES, ConfigError)
+        return _read_file(Path(source), ())
     except ConfigError as error:
         if not isinstance(error.__cause__, FileNotFoundError):
             raise
@@ -137,39 +140,76 @@ def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
         raise ConfigError(
             f"{source}: no such file or preset{meant} (presets: {', '.join(preset_names())})"
         ) from None
-    path = Path(source)
-    label = str(path)
-    if path.suffix.lower() != ".json":
-        return label, _with_base(label, _parse(text, label))
-    values = _parse(text, label, "JSON")
-    if sustaindc.is_of_format(values):
-        _, base = _read_preset("sustaindc")
-        return label, _merged(base, sustaindc.read(values, label))
-    return label, _with_base(label, values)
 
 
-def _read_preset(name: str) -> tuple[str, dict[str, Any]]:
-    label = f"preset {name}"
-    return label, deepcopy(_parse_preset(name, label))
+def _read_file(path: Path, extended_by: tuple[Path, ...]) -> tuple[str, dict[str, Any]]:
+    """Return label and values of a file, merged with the preset or file that it extends.
+
+    Args:
+        path: Path of the file.
+        extended_by: Files that extend each other in turn, the last of which extends this file.
+    """
+    text = read_text(path, MOST_CONFIG_BYTES, ConfigError)
+    label, is_json = str(path), path.suffix.lower() == ".json"
+    values = _parse(text, label, "JSON" if is_json else "YAML")
+    if is_json and sustaindc.is_of_format(values):
+        return label, _merged(_read_preset("sustaindc"), sustaindc.read(values, label))
+    base = values.pop("extends", None)
+    if base is None:
+        return label, values
+    if base in preset_names():
+        return label, _extended(_read_preset(base), values)
+    chain = (*extended_by, path)
+    base_label, base_values = _read_file(_extended_path(base, chain), chain)
+    return f"{label} (extends {base_label})", _extended(base_values, values)
+
+
+def _extended_path(base: Any, chain: tuple[Path, ...]) -> Path:
+    """Return the path of the file that the last file of a chain of files names under ``extends``.
+
+    Raises:
+        ConfigError: There is no such file, a file extends itself, or the chain is too long.
+    """
+    where = f"{chain[-1]}: extends: "
+    valid = f"valid is a preset ({', '.join(preset_names())}) or a file"
+    if not isinstance(base, str) or not base.strip():
+        raise ConfigError(f"{where}{shortened(base)} is no name; {valid}")
+    path = chain[-1].parent / base
+    if not os.path.isfile(path):
+        meant = suggestion(base, preset_names())
+        raise ConfigError(
+            f"{where}{shortened(base)} is no preset, and {shortened(str(path))} is no file{meant}; "
+            f"{valid}"
+        )
+    files = [*map(os.path.realpath, chain)]
+    if os.path.realpath(path) in files:
+        cycle = [*map(str, chain[files.index(os.path.realpath(path)) :]), str(path)]
+        raise ConfigError(
+            f"{where}{' -> '.join(cycle)} is a cycle; {valid} that does not extend this one"
+        )
+    if len(chain) == _MOST_FILES:
+        raise ConfigError(
+            f"{where}{shortened(base)} is file {_MOST_FILES + 1} of a chain of files that begins "
+            f"with {chain[0]}; valid are at most {_MOST_FILES}"
+        )
+    return path
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    return deepcopy(_parse_preset(name))
 
 
 @cache
-def _parse_preset(name: str, label: str) -> dict[str, Any]:
+def _parse_preset(name: str) -> dict[str, Any]:
     text = resources.files("sdc_taichi.configs").joinpath(f"{name}.yaml").read_text("utf-8")
-    return _with_base(label, _parse(text, label))
-
-
-def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Merge values with the preset that they name under ``extends``, if any."""
+    values = _parse(text, f"preset {name}")
     base = values.pop("extends", None)
-    if base is None:
-        return values
-    if base not in preset_names():
-        raise ConfigError(
-            f"{label}: extends: {shortened(base)} is no preset; valid: {', '.join(preset_names())}"
-        )
-    _, merged = _read_preset(str(base))
-    merged = _merged(merged, values)
+    return values if base is None else _extended(_read_preset(base), values)
+
+
+def _extended(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a base with those of a preset or file that extends it."""
+    merged = _merged(base, values)
     _replace_excluded(merged, values)
     return merged
 

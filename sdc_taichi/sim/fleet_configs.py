@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig, with_values
+from sdc_taichi.config import DataCenterConfig, preset_names, with_values
 from sdc_taichi.errors import ConfigError, DataError, shortened, suggestion, whole_number
 from sdc_taichi.exogenous.weather import read_city
 
@@ -28,8 +28,9 @@ def make_configs(
 ) -> list[DataCenterConfig]:
     """Create copies of one data center at several sites, with domain randomisation.
 
-    A copy is named after its location (see ``locations``), with its index appended if there are
-    more copies than sites.
+    Copies at ``sites``, and those of a preset, are named after their location (see
+    ``locations``); other copies keep the name of ``base``. If there are more copies than sites, a
+    name ends in the index of the copy.
 
     Args:
         base: Config of the data center to copy.
@@ -72,10 +73,21 @@ def make_configs(
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, index])))
             config = with_values(config, {path: _draw(rule, rng) for path, rule in rules.items()})
         configs.append(config)
+    names = place_names(configs) if sites else names_of_runs(configs)
     digits = len(str(count - 1)) if count > max(len(sites), 1) else 0
     return [
         config.model_copy(update={"name": f"{name}-{index:0{digits}d}" if digits else name})
-        for index, (config, name) in enumerate(zip(configs, place_names(configs), strict=True))
+        for index, (config, name) in enumerate(zip(configs, names, strict=True))
+    ]
+
+
+def names_of_runs(configs: Sequence[DataCenterConfig]) -> list[str]:
+    """Return the names of data centers in a run: their own, or the place if it is a preset's."""
+    presets = preset_names()
+    places = place_names(configs)
+    return [
+        place if config.name in presets else config.name
+        for config, place in zip(configs, places, strict=True)
     ]
 
 
