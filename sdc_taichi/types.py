@@ -573,7 +573,7 @@ class StepResult(
 
     def per_dc(self) -> dict[str, F64]:
         """Return all quantities of shape (B,) by name, in the order of ``QUANTITIES``."""
-        return dict(zip(_PER_DC, _values_per_dc(self), strict=True))
+        return dict(zip(QUANTITIES_PER_DC, _values_per_dc(self), strict=True))
 
 
 QUANTITIES: dict[str, Quantity] = {
@@ -582,8 +582,9 @@ QUANTITIES: dict[str, Quantity] = {
     if get_origin(hint) is Annotated
 }
 """Unit and axis of each quantity of ``StepResult``, in the order of its fields."""
-_PER_DC = tuple(name for name, each in QUANTITIES.items() if each.axis == DATA_CENTERS)
-_values_per_dc = attrgetter(*_PER_DC)
+QUANTITIES_PER_DC = tuple(n for n, each in QUANTITIES.items() if each.axis == DATA_CENTERS)
+"""Names of the quantities of shape (B,), in the order of ``QUANTITIES``."""
+_values_per_dc = attrgetter(*QUANTITIES_PER_DC)
 
 
 @cache

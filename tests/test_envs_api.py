@@ -227,8 +227,9 @@ def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool, mode: Auto
     for i, env in enumerate(singles):
         alone, info = env.reset(seed=11 + i)
         assert same(rows(found, i), alone)
-        assert info == {a: {"start_day": infos["start_day"][i]} for a in agents}
-    assert len(set(infos["start_day"])) > 1
+        assert info == dict.fromkeys(agents, rows(infos, i))
+    begun_days = infos["start_day"]
+    assert len(set(begun_days)) > 1
     rng = np.random.default_rng(0)
     for step in range(STEPS + 5):
         actions = {a: rng.integers(0, 3, size=(3, *(batch.action_spaces[a].shape))) for a in agents}
@@ -245,12 +246,13 @@ def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool, mode: Auto
             assert d == {a: bool(terminated[a][i]) for a in agents}
             assert t == {a: bool(truncated[a][i]) for a in agents} == dict.fromkeys(agents, ended)
             assert np.array_equal(state[i], env.state())
-            assert info[agents[0]] == {name: infos[name][i] for name in info[agents[0]]}
+            of_step = infos | ({"start_day": begun_days} if ends_here else {})
+            assert info[agents[0]] == {name: of_step[name][i] for name in info[agents[0]]}
         if not ended:
             continue
         if mode is AutoresetMode.NEXT_STEP:
             found, gained, terminated, truncated, infos = batch.step({})  # ignored
-            assert infos.keys() == {"start_day"}
+            assert infos.keys() == info[agents[0]].keys()
             assert same(gained, {a: np.zeros(3, np.float32) for a in agents})
             assert same(terminated, {a: np.zeros(3, np.bool_) for a in agents})
             assert same(truncated, terminated)
@@ -483,15 +485,98 @@ def test_infos_are_quantities_of_the_step() -> None:
     env.reset(seed=0)
     *_, infos = env.step(dict.fromkeys(AGENTS, np.array([1, 1])))
     view = env.core.view
-    assert infos.keys() == view.last.per_dc().keys()
+    assert infos.keys() == {"start_day", *view.last.per_dc()}
     assert np.array_equal(infos["carbon_g"], view.last.carbon_g)
     assert np.all(infos["it_kwh"] > 0)
     assert env.reward_terms().keys() == TERMS.keys()
     single = SdcEnv(**tiny())
-    assert single.reset(seed=0)[1].keys() == {"start_day"}
+    day = single.reset(seed=0)[1]["start_day"]
     *_, info = single.step(np.array([1, 1, 1]))
-    assert all(type(value) is float for value in info.values())
-    assert info == {name: infos[name][0] for name in info}
+    assert info == {"start_day": day} | {n: infos[n][0] for n in view.last.per_dc()}
+
+
+INTERFACES: dict[str, Callable[..., Any]] = {
+    "parallel_env": sdc_taichi.parallel_env,
+    "aec_env": sdc_taichi.aec_env,
+    "make": lambda **options: gymnasium.make("sdc_taichi/Battery-v0", **options),
+    "make_joint": lambda **options: gymnasium.make("sdc_taichi/Joint-v0", **options),
+    **{
+        f"{kind}-{mode.value}": lambda make=make, mode=mode, **options: make(
+            num_envs=2, autoreset_mode=mode, **options
+        )
+        for kind, make in (
+            ("vector_env", sdc_taichi.vector_env),
+            ("make_vec", lambda **options: gymnasium.make_vec("sdc_taichi/Joint-v0", **options)),
+        )
+        for mode in AutoresetMode
+    },
+    "sync": lambda **options: gymnasium.make_vec(
+        "sdc_taichi/Battery-v0", num_envs=2, vectorization_mode="sync", **options
+    ),
+    "async": lambda **options: AsyncVectorEnv(
+        [lambda: gymnasium.make("sdc_taichi:sdc_taichi/Battery-v0", **options)] * 2, context="spawn"
+    ),
+}
+"""Every interface of the environments, in every mode of batches."""
+
+
+def infos_of_steps(env: Any, steps: int) -> list[dict[str, Any]]:
+    """Infos of a reset and of steps with idle agents, those of the first agent where each has
+    its own; ``final_info`` follows the infos that contain it."""
+    out = []
+
+    def add(infos: dict[str, Any]) -> None:
+        first = next(iter(infos.values()))
+        out.append(first if isinstance(first, dict) else infos)
+        if "final_info" in infos:
+            out.append(infos["final_info"])
+
+    if hasattr(env, "agent_iter"):
+        env.reset(seed=0)
+        for agent in env.agent_iter(len(AGENTS) * steps):
+            *_, over, info = env.last()
+            out.append(info)
+            env.step(None if over else env.action_space(agent).sample())
+        return out
+    add(env.reset(seed=0)[1])
+    for _ in range(steps):
+        if hasattr(env, "action_spaces"):
+            shape = (env.num_envs,) if hasattr(env, "num_envs") else ()
+            actions: Any = {a: np.ones(shape, np.int64) for a in AGENTS}
+        else:
+            actions = env.action_space.sample()
+        *_, truncated, infos = env.step(actions)
+        add(infos)
+        over = np.all(list(truncated.values()) if isinstance(truncated, dict) else truncated)
+        mode = getattr(env, "metadata", {}).get("autoreset_mode", AutoresetMode.DISABLED)
+        if over and mode is AutoresetMode.DISABLED:
+            add(env.reset()[1])
+    return out
+
+
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_infos_of_reset_and_steps_have_the_same_keys_and_types(
+    interface: str, request: pytest.FixtureRequest
+) -> None:
+    options = tiny(years=3, traces=["alibaba_1", "google_1"], costs=["hot_inlets"])
+    env = INTERFACES[interface](**options)
+    request.addfinalizer(env.close)
+    infos = infos_of_steps(env, STEPS + 2)
+    added = {"final_obs", "final_state", "final_info"}
+    added |= {f"_{name}" for name in added}
+
+    def kinds(info: dict[str, Any]) -> dict[str, Any]:
+        return {
+            name: (type(value), getattr(value, "dtype", None), np.shape(value))
+            for name, value in info.items()
+            if name not in added
+        }
+
+    assert {"start_day", "year", "trace", "it_kwh", "cost", "cost_hot_inlets"} <= infos[0].keys()
+    assert np.all(infos[0]["it_kwh"] == 0.0)
+    assert np.all(infos[0]["cost"] == 0.0)
+    for info in infos[1:]:
+        assert kinds(info) == kinds(infos[0])
 
 
 def test_start_day() -> None:
@@ -499,13 +584,13 @@ def test_start_day() -> None:
     days = {env.reset(seed=s)[1]["agent_ls"]["start_day"] for s in range(20)}
     assert len(days) > 5
     assert all(151 <= day < 181 for day in days)
-    assert env.reset(options={"start_day": "03-01"})[1]["agent_ls"] == {"start_day": 59}
-    assert env.reset(options={"start_day": 200})[1]["agent_ls"] == {"start_day": 200}
+    assert env.reset(options={"start_day": "03-01"})[1]["agent_ls"]["start_day"] == 59
+    assert env.reset(options={"start_day": 200})[1]["agent_ls"]["start_day"] == 200
     batch = multi_agent(2, **tiny())
     _, infos = batch.reset(options={"start_day": ["01-01", "12-31"]})
     assert infos["start_day"].tolist() == [0, 364]
     fixed = SdcEnv(config=load_config("tiny", ["site.start=05-02"]), days=1, start="fixed")
-    assert fixed.reset(seed=0)[1] == fixed.reset(seed=1)[1] == {"start_day": 121}
+    assert [fixed.reset(seed=seed)[1]["start_day"] for seed in (0, 1)] == [121, 121]
 
 
 def test_bad_actions_of_one_learner() -> None:

@@ -12,12 +12,13 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from pydantic import BaseModel
 
 from sdc_taichi.control.view import ForecastError
-from sdc_taichi.envs.core import Core, Observation, Transition
+from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.images import RENDER_MODES, Image, check_render_mode, frame
 from sdc_taichi.envs.options import (
     ConfigSource,
@@ -111,7 +112,7 @@ class SingleEnv(Environment):
 
     def reward_terms(self) -> dict[str, float]:
         """Return all reward terms of the last step by name, unscaled; empty before any step."""
-        return as_floats(self.core.reward_terms())
+        return as_scalars(self.core.reward_terms())
 
     def render(self) -> Image:
         """Return a picture of the hall after the last step, (height, width, 3).
@@ -203,21 +204,9 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
     return values.get("start_day")
 
 
-def first_info(core: Core) -> dict[str, Any]:
-    """Return the infos of the batch's first environment after a reset, as numbers and text."""
-    return {name: values.tolist()[0] for name, values in core.start_info().items()}
-
-
-def step_info(transition: Transition) -> dict[str, F64]:
-    """Return all quantities of a step's result and its costs by name, (B,) each."""
-    info = transition.result.per_dc()
-    info.update(transition.costs)
-    return info
-
-
-def as_floats(quantities: Mapping[str, F64]) -> dict[str, float]:
-    """Convert the arrays of a batch of one environment, (1,) each, to floats."""
-    return {name: values.item() for name, values in quantities.items()}
+def as_scalars(by_name: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    """Convert the arrays of a batch of one environment, (1,) each, to numbers and text."""
+    return {name: values.item() for name, values in by_name.items()}
 
 
 def first_of_batch(observation: Observation) -> Observation:

@@ -52,7 +52,7 @@ from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet_configs import MOST_DCS
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
+from sdc_taichi.types import F32, F64, I64, QUANTITIES_PER_DC, Actions, State, StepResult
 
 Observation = F32 | dict[str, F32]
 """Observations of one agent in B environments: an array (B, n), or with option ``heat_map`` a dict
@@ -337,6 +337,24 @@ class Core:
         """
         start = self.view.state.start // self._steps_per_day
         return {"start_day": np.asarray(start, dtype=np.int64), **draw_info(self._draw)}
+
+    def infos(self, transition: Transition | None = None) -> dict[str, npt.NDArray[Any]]:
+        """Return the infos of a step, or those of a reset without one, by name, (B,) each.
+
+        Both have the same keys and types, because some libraries read the infos of a reset to know
+        those of all steps: the start day and the drawn inputs of the current episodes, and
+        quantities and costs of the step. At a reset, quantities and costs are 0.
+
+        Args:
+            transition: result of the step; None after a reset.
+        """
+        of_step: dict[str, F64]
+        if transition is None:
+            names = (*QUANTITIES_PER_DC, *self._costs.names)
+            of_step = dict(zip(names, np.zeros((len(names), self.num_envs)), strict=True))
+        else:
+            of_step = {**transition.result.per_dc(), **transition.costs}
+        return {**self.start_info(), **of_step}
 
     def state(self) -> F32:
         """Return the shared state for centralised critics: all features of all agents, (B, m)."""

@@ -109,6 +109,11 @@ class Costs:
                 "electrical.grid_limit_kw or grid_limit_ratio"
             )
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the costs that ``of`` returns, in order."""
+        return ("cost", *(f"cost_{name}" for name in self._functions)) if self._functions else ()
+
     def of(self, result: StepResult, view: View) -> dict[str, F64]:
         """Return each cost of a step as ``cost_NAME`` and their weighted sum as ``cost``.
 

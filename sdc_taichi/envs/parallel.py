@@ -12,11 +12,9 @@ from sdc_taichi.envs.base import (
     METADATA,
     AgentSpaces,
     SingleEnv,
-    as_floats,
-    first_info,
+    as_scalars,
     first_of_batch,
     start_day_option,
-    step_info,
 )
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.options import ConfigSource
@@ -26,9 +24,9 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
     """PettingZoo environment in which the learning agents of one data center act at the same time.
 
     Episodes end by truncation, because their length is a choice and a data center has no final
-    state. All agents have the same infos. Infos of ``reset`` are ``start_day`` and the randomly
-    drawn inputs. Infos of a step are the facility's quantities of ``StepResult`` by name, and the
-    costs of the option ``costs``.
+    state. All agents have the same infos: ``start_day``, the randomly drawn inputs, the facility's
+    quantities of ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset``
+    have the same keys; quantities and costs are 0 there.
 
     Args:
         config: a preset, a file or a config.
@@ -67,7 +65,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """
         observations = self.core.reset(seed, start_day_option(options, strict=False))
         self.agents = list(self.possible_agents)
-        info = first_info(self.core)
+        info = as_scalars(self.core.infos())
         return _first_of_each(observations), {agent: dict(info) for agent in self.agents}
 
     def step(
@@ -92,12 +90,12 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         if isinstance(actions, Mapping):
             actions = {agent: [action] for agent, action in actions.items()}
         transition = self.core.step(actions)
-        agents, info = self.agents, as_floats(step_info(transition))
+        agents, info = self.agents, as_scalars(self.core.infos(transition))
         if transition.ended:
             self.agents = []
         return (
             _first_of_each(transition.observations),
-            as_floats(transition.rewards),
+            as_scalars(transition.rewards),
             dict.fromkeys(agents, False),
             dict.fromkeys(agents, transition.ended),
             {agent: dict(info) for agent in agents},

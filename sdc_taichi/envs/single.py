@@ -15,11 +15,9 @@ from sdc_taichi.envs.base import (
     METADATA,
     HasSpec,
     SingleEnv,
-    as_floats,
-    first_info,
+    as_scalars,
     first_of_batch,
     start_day_option,
-    step_info,
 )
 from sdc_taichi.envs.core import Core, Observation, Transition
 from sdc_taichi.envs.features import entries_of_new_features
@@ -184,8 +182,9 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
     """Gymnasium environment of one data center with one learner.
 
     Episodes end by truncation, because their length is a choice and a data center has no final
-    state. Infos of ``reset`` are ``start_day`` and the randomly drawn inputs. Infos of a step are
-    the facility's quantities of ``StepResult`` by name, and the costs of the option ``costs``.
+    state. Infos are ``start_day``, the randomly drawn inputs, the facility's quantities of
+    ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset`` have the same
+    keys; quantities and costs are 0 there.
 
     Args:
         config: a preset, a file or a config.
@@ -231,7 +230,7 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         observations = self.core.reset(seed, start_day_option(options))
         super().reset(seed=None if seed is None else int(seed))
         observation = first_of_batch(self._learner.observation(observations))
-        return observation, first_info(self.core)
+        return observation, as_scalars(self.core.infos())
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance the data center by one step.
@@ -243,7 +242,7 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         transition = self.core.step(self._learner.actions([action]))
         observation = first_of_batch(self._learner.observation(transition.observations))
         reward = float(self._learner.reward(transition)[0])
-        info = as_floats(step_info(transition))
+        info = as_scalars(self.core.infos(transition))
         return observation, reward, False, transition.ended, info
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:

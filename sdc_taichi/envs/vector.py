@@ -18,7 +18,6 @@ from sdc_taichi.envs.base import (
     HasSpec,
     check_steps,
     start_day_option,
-    step_info,
 )
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episodes import Seed
@@ -88,6 +87,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.core.end_after(check_steps(max_episode_steps, self.core))
         self.num_envs = num_envs = self.core.num_envs
         self.metadata = METADATA | {"autoreset_mode": self._mode}
+        self.autoreset_mode = self._mode  # an attribute of Gymnasium's own batches as well
         self._learner = make_learner(self.core, agent)
         self.single_observation_space = self._learner.observation_space
         self.single_action_space = self._learner.action_space
@@ -121,7 +121,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             )
         observations = self.core.reset(seed, start_day_option(reset_options))
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
-        return self._learner.observation(observations), self._infos(self.core.start_info())
+        return self._learner.observation(observations), self._infos(self.core.infos())
 
     def step(self, actions: Any) -> tuple[Observation, F64, Flags, Flags, dict[str, Any]]:
         """Advance all environments by one step.
@@ -140,11 +140,11 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             return observation, np.zeros(self.num_envs), none, none.copy(), infos
         transition = self.core.step(self._learner.actions(actions))
         observation = self._learner.observation(transition.observations)
-        infos = self._infos(step_info(transition))
+        infos = self._infos(self.core.infos(transition))
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             final = {"final_obs": self._one_by_one(observation), "final_info": infos}
             observation = self._learner.observation(self.core.next_episode())
-            infos = self._infos({**final, **self.core.start_info()})
+            infos = self._infos({**final, **self.core.infos()})
         ended = np.full(self.num_envs, transition.ended)
         return observation, self._learner.reward(transition), none, ended, infos
 
@@ -300,14 +300,14 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
                 year, from 0, or one day for each environment.
 
         Returns:
-            Observations by agent, (B, n) each, and infos: ``start_day`` and the randomly drawn
-            inputs, (B,) each.
+            Observations by agent, (B, n) each, and infos, (B,) each, with the keys of the infos of
+            a step. Quantities and costs are 0.
 
         Raises:
             ConfigError: a seed, option or day is not valid.
         """
         observations = self.core.reset(seed, start_day_option(options))
-        return observations, self.core.start_info()
+        return observations, self.core.infos()
 
     def step(
         self, actions: Mapping[str, Any]
@@ -327,7 +327,8 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
 
         Returns:
             Observations, rewards, terminations and truncations by agent, and infos. Infos contain
-            the (B,) quantities of the step's ``StepResult`` and the costs, by name.
+            ``start_day``, the randomly drawn inputs, the (B,) quantities of the step's
+            ``StepResult`` and the costs, by name.
 
         Raises:
             SdcError: the actions of an agent are missing or outside their space, or there are
@@ -346,7 +347,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
             )
         transition = self.core.step(actions)
         observations = transition.observations
-        infos: dict[str, Any] = step_info(transition)
+        infos: dict[str, Any] = self.core.infos(transition)
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
