@@ -106,6 +106,32 @@ def drips(content: bytes, pause_s: float, stopped: Callable[[], threading.Event]
     return answer
 
 
+def drips_within(
+    head: bytes, drop: bytes, tail: bytes, pause_s: float, stopped: Callable[[], threading.Event]
+) -> Answer:
+    """Bytes of an answer as they are: a head, for some seconds drop after drop, then a tail."""
+
+    def answer(request: BaseHTTPRequestHandler) -> None:
+        request.wfile.write(head)
+        for _ in range(round(8.0 / pause_s)):
+            if stopped().wait(pause_s):
+                return
+            request.wfile.write(drop)
+            request.wfile.flush()
+        request.wfile.write(tail)
+
+    return answer
+
+
+def sends_bytes(content: bytes) -> Answer:
+    """Bytes of an answer as they are, with status line and headers."""
+
+    def answer(request: BaseHTTPRequestHandler) -> None:
+        request.wfile.write(content)
+
+    return answer
+
+
 def silent(stopped: Callable[[], threading.Event]) -> Answer:
     """No answer while the server runs."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import zipfile
 from collections.abc import Callable, Iterator
 from datetime import date
@@ -214,8 +215,39 @@ def test_weather_by_address(run: Callable[..., Result], data_dir: Path, content:
     assert result.exit_code == 0, result.output
     assert load_site("here").label == "Test.Station, NY, USA"
     url = metadata(data_dir, "weather")["origin"]["downloads"][0]["url"]
-    assert url.endswith("/a/USA_NY_Station%20x.zip?v=1")
-    assert run(None, *args, url).exit_code == 0
+    assert url.endswith("/a/USA_NY_Station%20x.zip")
+    assert run(None, *args, f"{url}?v=1").exit_code == 0
+    assert "no connection" in error(run(None, *args, f"{url}?v=2"))
+
+
+def test_a_token_in_an_address_goes_nowhere(
+    run: Callable[..., Result], data_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    token, other = "hunter-2", "3f1c9a0b7e5d4c21aa"
+    lines = list(epw_lines())
+    lines[5] = f"COMMENTS 1,from /x.epw?token={token}&x={other}"
+    epw = text(lines).encode()
+    address = f"SERVER/x.epw?token={token}&x={other}&v=1#{token}"
+    outputs = []
+    for content in (epw, archive(Station_epw=epw)):
+        result = run(sends(content), "epw", "--site=here", address, "--refresh")
+        assert result.exit_code == 0, result.output
+        outputs.append(result.output)
+    for answer in (
+        sends(json.dumps({"message": f"no {token}"}).encode(), 403),
+        sends(f"{token} is no EPW file".encode()),
+        sends(b"", 302, Location=f"http://example.invalid/{other}"),
+        sends(archive(**{f"{token}_epw": EPW, "b_epw": EPW})),
+        None,
+    ):
+        outputs.append(error(run(answer, "epw", "--site=here", address, "--refresh")))
+    outputs.append(error(run(None, "epw", "--site=here", address.replace("SERVER", "ftp://a"))))
+    content = [path.read_bytes() for path in data_dir.rglob("*") if path.is_file()]
+    names = [path.name for path in data_dir.rglob("*")]
+    for secret in (token, other):
+        assert secret not in " ".join([*outputs, *names, caplog.text])
+        assert secret.encode() not in b"".join(content)
 
 
 @pytest.mark.parametrize(

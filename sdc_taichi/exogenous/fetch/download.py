@@ -3,7 +3,7 @@
 A download ends within a limited time, either with a complete answer or with an error of one line.
 After temporary failures (no connection, no answer, statuses 408, 425, 429 and 5xx, an incomplete
 answer) the request is repeated. The waits double each time, or follow the service's request.
-Messages never quote the HTTP library, because its text contains the address with the key.
+No message, log or file contains the key, or a token in an address that the user gave.
 
 Answers are stored in the folder of imported files, under ``downloads/SERVICE``. Each file is stored
 as the service sent it, without the key. ``NAME.origin.json`` beside it has address, time, checksum
@@ -12,56 +12,37 @@ and licence.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import logging
 import os
 import random
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http import HTTPStatus
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote, urlencode, urlsplit
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import DataError, SdcError, shortened
+from sdc_taichi.exogenous.fetch.exchange import Answer, ExchangeError, Patience, exchange
+from sdc_taichi.exogenous.fetch.redaction import Redaction, secrets_of_query
 from sdc_taichi.exogenous.fetch.services import Service
 from sdc_taichi.exogenous.registry import user_data_dir
 from sdc_taichi.user_file import read_bytes
-
-if TYPE_CHECKING:
-    import requests
 
 FORMAT = "sdc-download/1"
 """Name and version of the format of origin files."""
 MOST_DOWNLOAD_BYTES = 64_000_000
 """Largest valid answer of a service, in bytes: fifty times a typical year of PVGIS."""
 _MOST_ORIGIN_BYTES = 100_000
-_CHUNK_BYTES = 1 << 14
 _PASSING = frozenset({408, 425, 429})
 """Statuses below 500 after which the request is repeated."""
 _KEY = re.compile(r"[A-Za-z0-9_-]{8,200}")
-
-
-@dataclass(frozen=True)
-class Patience:
-    """Limits on time and attempts of a download."""
-
-    connect_s: float = 10.0
-    """Maximum wait for a connection, in s."""
-    read_s: float = 60.0
-    """Maximum wait for the next bytes of an answer, in s."""
-    total_s: float = 300.0
-    """Maximum duration of a download with all attempts and waits, in s."""
-    attempts: int = 6
-    """Maximum number of attempts."""
-    first_wait_s: float = 1.0
-    """Maximum wait after the first attempt, in s; it doubles after each further attempt."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +66,28 @@ class Request:
     DataError if the answer is not what was requested."""
     most_bytes: int = MOST_DOWNLOAD_BYTES
     """Largest valid answer, in bytes."""
+    private_query: str = field(default="", repr=False)
+    """Query of an address that the user gave, which may hold tokens: sent, but neither shown nor
+    stored."""
 
     @property
     def url(self) -> str:
-        """Address with the query, without the key."""
+        """Address with the query, without the key and the private query."""
         query = urlencode(self.query, quote_via=quote)
         return f"{self.address}?{query}" if query else self.address
+
+    @property
+    def private_url(self) -> str:
+        """Address as it is sent, with the key and the private query."""
+        key = self.service.key
+        with_key = urlencode({key.parameter: self.key}, quote_via=quote) if self.key and key else ""
+        private = "&".join(filter(None, (self.private_query, with_key)))
+        return f"{self.url}{'&' if '?' in self.url else '?'}{private}" if private else self.url
+
+    @property
+    def redaction(self) -> Redaction:
+        """Redaction of the secrets in the address."""
+        return Redaction({self.key} | secrets_of_query(self.private_query))
 
     @property
     def host(self) -> str:
@@ -108,18 +105,6 @@ class Kept:
     """Bytes of the answer."""
     origin: dict[str, Any]
     """Address without the key, time in UTC, checksum, licence and publisher."""
-
-
-class _AttemptError(Exception):
-    """A failed attempt, with the wait in s that the service requests, if any.
-
-    ``passes`` is True for a temporary failure, after which another attempt may succeed.
-    """
-
-    def __init__(self, reason: str, wait_s: float | None = None, *, passes: bool = True) -> None:
-        super().__init__(reason)
-        self.wait_s = wait_s
-        self.passes = passes
 
 
 def read_key(service: Service) -> str:
@@ -223,64 +208,46 @@ def download(
         DataError: no answer came in time, the answer is too large or not what was requested, or
             the HTTP library is not installed.
     """
-    try:
-        import requests
-    except ImportError:
-        raise DataError(
-            'data fetch needs the library requests: pip install "sdc-taichi[fetch]"'
-        ) from None
+    if find_spec("requests") is None:
+        raise DataError('data fetch needs the library requests: pip install "sdc-taichi[fetch]"')
     patience = patience or Patience()
+    redaction = request.redaction
+    try:
+        return _download(request, redaction, patience, sleep)
+    except DataError as error:
+        raise DataError(redaction.in_text(str(error))) from None
+
+
+def _download(
+    request: Request, redaction: Redaction, patience: Patience, sleep: Callable[[float], None]
+) -> bytes:
     end = time.monotonic() + patience.total_s
     by_hand = f"; by hand: {request.by_hand}" if request.by_hand else ""
-    with requests.Session() as session, _without_key_in_logs(request.key):
-        for attempt in range(1, patience.attempts + 1):
-            try:
-                return _attempt(session, request, patience, end)
-            except _AttemptError as failed:
-                reason, retry_s, passes = str(failed), failed.wait_s, failed.passes
-            if not passes:
-                raise DataError(f"{request.host}: {reason}{by_hand}")
-            longest_s = patience.first_wait_s * 2 ** (attempt - 1)
-            wait_s = random.uniform(0.5, 1.0) * longest_s if retry_s is None else retry_s
-            if time.monotonic() + wait_s > end:
-                retry = f", and asks to wait {retry_s:,.0f} s" if retry_s else ""
-                raise DataError(
-                    f"{request.host}: {reason}{retry}; no answer within {patience.total_s:g} s, "
-                    f"try later{by_hand}"
-                )
-            if attempt < patience.attempts:
-                sleep(wait_s)
+    for attempt in range(1, patience.attempts + 1):
+        try:
+            return _attempt(request, redaction, patience, end)
+        except ExchangeError as failed:
+            reason, retry_s, passes = str(failed), failed.wait_s, failed.passes
+        if not passes:
+            raise DataError(f"{request.host}: {reason}{by_hand}")
+        longest_s = patience.first_wait_s * 2 ** (attempt - 1)
+        wait_s = random.uniform(0.5, 1.0) * longest_s if retry_s is None else retry_s
+        if time.monotonic() + wait_s > end:
+            retry = f", and asks to wait {retry_s:,.0f} s" if retry_s else ""
+            raise DataError(
+                f"{request.host}: {reason}{retry}; no answer within {patience.total_s:g} s, "
+                f"try later{by_hand}"
+            )
+        if attempt < patience.attempts:
+            sleep(wait_s)
     raise DataError(f"{request.host}: {reason}, {patience.attempts} times{by_hand}")
 
 
-def _attempt(session: requests.Session, request: Request, patience: Patience, end: float) -> bytes:
-    query = dict(request.query)
-    if request.key and request.service.key:
-        query[request.service.key.parameter] = request.key
-    content, failure = b"", ""
-    with _naming_failures(patience):
-        response = session.get(
-            request.address,
-            params=urlencode(query, quote_via=quote),
-            timeout=(patience.connect_s, patience.read_s),
-            stream=True,
-            # Prevent the use of credentials in a .netrc file, which are for other purposes.
-            auth=lambda prepared: prepared,
-        )
-    with contextlib.closing(response), _naming_failures(patience):
-        for chunk in response.iter_content(_CHUNK_BYTES):
-            content += chunk
-            if len(content) > request.most_bytes:
-                failure = f"more than {request.most_bytes / 1e6:,.1f} MB, the most that is valid"
-                break
-            if time.monotonic() > end:
-                raise _AttemptError(f"a slow answer, {len(content):,} bytes so far", 0.0)
-    if failure:
-        raise DataError(f"{request.url}: the answer has {failure}")
-    if request.key:
-        content = content.replace(request.key.encode(), b"KEY")
-    if response.status_code != HTTPStatus.OK:
-        _refuse(request, response, content)
+def _attempt(request: Request, redaction: Redaction, patience: Patience, end: float) -> bytes:
+    answer = exchange(request.private_url, redaction, request.most_bytes, patience, end)
+    content = answer.content
+    if answer.status != HTTPStatus.OK:
+        _refuse(request, answer)
     if re.match(rb"\s*(<!doctype html|<html)", content, re.IGNORECASE):
         raise DataError(
             f"{request.url}: an HTML page came in place of data (of a proxy, a log-in or an error)"
@@ -289,15 +256,13 @@ def _attempt(session: requests.Session, request: Request, patience: Patience, en
     return content
 
 
-def _refuse(request: Request, response: requests.Response, content: bytes) -> None:
+def _refuse(request: Request, answer: Answer) -> None:
     """Raise an error for a status other than success."""
-    status = response.status_code
+    status = answer.status
     phrase = next((f" ({each.phrase})" for each in HTTPStatus if each == status), "")
     if status in _PASSING or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-        retry_after = response.headers.get("Retry-After", "")
-        wait_s = float(retry_after) if retry_after.isdecimal() else None
-        raise _AttemptError(f"status {status}{phrase}", wait_s)
-    text = content[:10_000].decode("utf-8", errors="replace")
+        raise ExchangeError(f"status {status}{phrase}", answer.retry_after_s)
+    text = answer.content[:10_000].decode("utf-8", errors="replace")
     # Services explain errors in JSON ("message", "error") or in XML (<text>).
     message = re.search(r'"(?:message|error)"\s*:\s*"(.*?)"|<text>(.*?)</text>', text, re.DOTALL)
     explained = f": {shortened(message[1] or message[2], 200)}" if message else ""
@@ -308,53 +273,6 @@ def _refuse(request: Request, response: requests.Response, content: bytes) -> No
             f"{request.service.page}"
         )
     raise DataError(f"{request.url}: status {status}{phrase}{explained}")
-
-
-@contextlib.contextmanager
-def _naming_failures(patience: Patience) -> Iterator[None]:
-    """Convert failures of the HTTP library to reasons without its text, which may show the key."""
-    import requests.exceptions as failures
-    from urllib3.exceptions import NameResolutionError
-
-    reason, passes = "", True
-    try:
-        yield
-    except failures.ConnectTimeout:
-        reason = f"no connection within {patience.connect_s:g} s"
-    except failures.Timeout:
-        reason = f"no answer within {patience.read_s:g} s"
-    except (failures.ChunkedEncodingError, failures.ContentDecodingError):
-        reason = "an answer that is cut off"
-    except failures.SSLError:
-        reason, passes = "no certificate that is trusted here", False
-    except failures.ProxyError:
-        reason, passes = "the proxy does not connect", False
-    except failures.ConnectionError as failed:
-        cause = getattr(failed.args[0] if failed.args else None, "reason", None)
-        passes = not isinstance(cause, NameResolutionError)
-        reason = "no connection" if passes else "not found (is there a network?)"
-    except failures.RequestException:
-        reason, passes = "no valid address, or too many redirects", False
-    # Raise outside of the handlers, so that no traceback shows the text of the library.
-    if reason:
-        raise _AttemptError(reason, passes=passes)
-
-
-@contextlib.contextmanager
-def _without_key_in_logs(key: str) -> Iterator[None]:
-    """Hide the key in the debug log of the HTTP library."""
-
-    def hide(record: logging.LogRecord) -> bool:
-        if key:
-            record.msg, record.args = record.getMessage().replace(key, "KEY"), ()
-        return True
-
-    logger = logging.getLogger("urllib3.connectionpool")
-    logger.addFilter(hide)
-    try:
-        yield
-    finally:
-        logger.removeFilter(hide)
 
 
 def _paths(request: Request, data_dir: Path | None) -> tuple[Path, Path]:

@@ -112,7 +112,7 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
 
     Args:
         into: site to which the weather is added.
-        url: address of the file, or of a ZIP archive that contains it.
+        url: address of the file, or of a ZIP archive that contains it; its query is not stored.
 
     Raises:
         DataError: the EPW file is not available or not valid.
@@ -120,8 +120,9 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
     name = importing.site_name(into.site, into.data_dir)
     request = weather.request_epw(url)
     (answer,) = into.downloads([request])
-    path, plain = answer.path, weather.epw_bytes(answer.content, url)
+    path, plain = answer.path, weather.epw_bytes(answer.content, request.url)
     if plain is not answer.content:
+        plain = request.redaction.in_bytes(plain)
         path = write_file(path.with_name(f"{path.stem}.unpacked.epw"), plain)
     origin = _origin(request.service, [answer])
     with into.checking():

@@ -156,6 +156,7 @@ def request_epw(url: str) -> Request:
 
     Args:
         url: address of an EPW file, or of a ZIP archive with one, as at climate.onebuilding.org.
+            Its query may hold a token, so it is neither shown nor stored.
 
     Raises:
         DataError: the text is not a web address, or it contains a password.
@@ -166,7 +167,8 @@ def request_epw(url: str) -> Request:
         parts = urlsplit("")
     # HTTP libraries differ on host names with a space, so refuse them here.
     if parts.scheme not in ("http", "https") or not parts.hostname or " " in parts.netloc:
-        raise DataError(f"{shortened(url)}: expected an address that begins with https://")
+        shown = re.sub("//.*@", "//", re.split("[?#]", url)[0])
+        raise DataError(f"{shortened(shown)}: expected an address that begins with https://")
     if parts.username is not None or parts.password is not None:
         raise DataError(f"{parts.hostname}: an address with a password, expected one without")
     name = unquote(parts.path.rsplit("/", 1)[-1])
@@ -174,7 +176,14 @@ def request_epw(url: str) -> Request:
     # Different addresses may end in equal file names, so add a hash of the address.
     name = f"{hashlib.sha256(url.encode()).hexdigest()[:8]}_{name}"
     by_hand = "save it with a browser, then data import FILE --site NAME"
-    return Request(services()["epw"], url, name, by_hand=by_hand, check=epw_bytes)
+    return Request(
+        services()["epw"],
+        parts._replace(query="", fragment="").geturl(),
+        name,
+        private_query=parts.query,
+        by_hand=by_hand,
+        check=epw_bytes,
+    )
 
 
 def epw_bytes(content: bytes, url: str) -> bytes:
