@@ -28,7 +28,8 @@ from faulty_server import (
     silent,
 )
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous.fetch.download import Patience, Request, download, fetch, read_key
+from sdc_taichi.exogenous.fetch.download import Request, download, fetch, read_key
+from sdc_taichi.exogenous.fetch.exchange import Patience
 from sdc_taichi.exogenous.fetch.redaction import Redaction
 from sdc_taichi.exogenous.fetch.services import KeySource, Service
 from sdc_taichi.user_file import decoding

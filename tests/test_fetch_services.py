@@ -21,7 +21,8 @@ from faulty_server import Answer, sends, serving
 from sdc_taichi.cli.app import app
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import load_site, series_file
-from sdc_taichi.exogenous.fetch.download import MOST_DOWNLOAD_BYTES, Patience
+from sdc_taichi.exogenous.fetch.download import MOST_DOWNLOAD_BYTES
+from sdc_taichi.exogenous.fetch.exchange import Patience
 from sdc_taichi.exogenous.fetch.generation import (
     MOST_EIA_ROWS,
     Period,
@@ -243,11 +244,11 @@ def test_a_token_in_an_address_goes_nowhere(
     ):
         outputs.append(error(run(answer, "epw", "--site=here", address, "--refresh")))
     outputs.append(error(run(None, "epw", "--site=here", address.replace("SERVER", "ftp://a"))))
-    content = [path.read_bytes() for path in data_dir.rglob("*") if path.is_file()]
+    stored = b"".join(path.read_bytes() for path in data_dir.rglob("*") if path.is_file())
     names = [path.name for path in data_dir.rglob("*")]
     for secret in (token, other):
         assert secret not in " ".join([*outputs, *names, caplog.text])
-        assert secret.encode() not in b"".join(content)
+        assert secret.encode() not in stored
 
 
 @pytest.mark.parametrize(

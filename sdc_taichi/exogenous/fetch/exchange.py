@@ -192,7 +192,7 @@ def _follow(
 
 def _answer(response: requests.Response, redaction: Redaction, most_bytes: int) -> Answer:
     lengths = set(re.split(r"\s*,\s*", response.headers.get("Content-Length", "0")))
-    if len(lengths) > 1 or not _LENGTH.fullmatch(*lengths):
+    if len(lengths) > 1 or not all(map(_LENGTH.fullmatch, lengths)):
         raise ExchangeError("an answer with a wrong Content-Length", passes=False)
     encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
     if encoding not in ("", "identity", "gzip", "x-gzip"):

@@ -15,13 +15,13 @@ from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.fetch import weather
 from sdc_taichi.exogenous.fetch.download import (
     Kept,
-    Patience,
     Request,
     downloads_dir,
     fetch,
     keep_file,
     write_file,
 )
+from sdc_taichi.exogenous.fetch.exchange import Patience
 from sdc_taichi.exogenous.fetch.generation import (
     carbon_table,
     read_generation,
