@@ -30,7 +30,7 @@ PYTHON ?= python3.13 python3.12 python3.11 python3 python
 # A file stays with one process, because its fixtures are shared; each process may take 1 GB.
 SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
 TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py \
-    tests/test_ray*.py tests/test_offline*.py)
+    tests/test_ray*.py tests/test_offline*.py tests/test_user_functions.py)
 TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/make/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz

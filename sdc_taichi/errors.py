@@ -7,8 +7,11 @@ a problem after which the work continues.
 from __future__ import annotations
 
 import difflib
+import sysconfig
+import traceback
 from collections.abc import Iterable
 from numbers import Integral
+from pathlib import Path
 
 MOST_CHARACTERS = 800
 """Largest length of a message in characters; the middle of a longer one is cut out."""
@@ -76,6 +79,28 @@ class SdcWarning(UserWarning):
 
 class OddInputWarning(SdcWarning):
     """An input is valid, but probably not what the user intended."""
+
+
+def place_in_user_code(error: BaseException) -> str:
+    """Return ``FILE:LINE`` of the innermost call of an error in code that the package called.
+
+    Args:
+        error: the error, with its traceback.
+
+    Returns:
+        The place; empty if the error passed through no function of a user.
+    """
+    place, in_package = "", False
+    library, installed = sysconfig.get_path("stdlib"), {"site-packages", "dist-packages"}
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = frame.f_code.co_filename
+        if str(frame.f_globals.get("__name__")).partition(".")[0] == "sdc_taichi":
+            in_package = True
+        elif in_package and not (
+            file.startswith(("<", library)) or installed & {*Path(file).parts}
+        ):
+            place = f"{file}:{line}"
+    return place
 
 
 def whole_number(what: str, value: object, low: int, high: int) -> int:

@@ -527,10 +527,9 @@ def test_full_disk_is_an_error_in_one_line(tmp_path: Path) -> None:
 def test_unexpected_errors_are_one_line_unless_debugging(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*_: object) -> StepResult:
-        raise ZeroDivisionError("by zero\nof all things")
-
-    monkeypatch.setattr(Simulator, "step", broken)
+    names: dict[str, Any] = {"__name__": "sdc_taichi.broken"}
+    exec("def broken(*_): raise ZeroDivisionError('by zero\\nof all things')", names)
+    monkeypatch.setattr(Simulator, "step", names["broken"])
     arguments = ("simulate", "tiny", "--days", 0.25, "--out", tmp_path / "run")
     done = call(*arguments)
     assert done.exit_code == 1

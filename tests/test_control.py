@@ -362,7 +362,7 @@ def test_import_paths_that_lead_nowhere_are_errors(spec: str, message: str, sim:
 
 def test_code_that_a_file_names_is_not_run(sim: Simulator) -> None:
     with pytest.raises(ConfigError, match="is an import path, and code that a file names is not"):
-        make_controller(f"{__name__}:AlwaysCharge", sim.fleet, imports=False)
+        make_controller(f"{__name__}:AlwaysCharge", sim.fleet, allow_code=False)
 
 
 def test_an_object_is_copied(sim: Simulator) -> None:

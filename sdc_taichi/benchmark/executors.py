@@ -20,6 +20,7 @@ from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, compute_in_one_threa
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.errors import ConfigError, SdcWarning, whole_number
 from sdc_taichi.kernels.compiler.runtime import allowed_processors, processor_quota
+from sdc_taichi.user_functions import CodePermission, code_permission, set_code_permission
 
 MOST_WORKERS = 1024
 """Maximum number of worker processes."""
@@ -214,7 +215,7 @@ def run_jobs(
 def _pool_of_one(inputs: Inputs) -> ProcessPoolExecutor:
     """Return a pool with one worker process, which receives the inputs when it starts."""
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, context, _begin_worker, (inputs,))
+    return ProcessPoolExecutor(1, context, _begin_worker, (inputs, code_permission()))
 
 
 @contextlib.contextmanager
@@ -257,12 +258,13 @@ _inputs: dict[str, bytes] = {}
 """Inputs of jobs, if this process is a worker."""
 
 
-def _begin_worker(inputs: Inputs) -> None:
-    """Prepare a worker process: signals, monitoring of the parent, one thread, inputs."""
+def _begin_worker(inputs: Inputs, permission: CodePermission | None) -> None:
+    """Prepare a worker process: signals, monitoring of the parent, one thread, code, inputs."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     compute_in_one_thread()
+    set_code_permission(permission)
     _inputs.update(inputs)
 
 

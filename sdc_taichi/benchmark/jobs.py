@@ -22,7 +22,7 @@ from pydantic_core import to_json
 
 from sdc_taichi.benchmark.vary import value_at
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import SdcError, SdcWarning, one_line, shortened
+from sdc_taichi.errors import SdcError, SdcWarning, one_line, place_in_user_code, shortened
 from sdc_taichi.user_file import read_bytes
 
 if TYPE_CHECKING:
@@ -259,6 +259,8 @@ def parquet(rows: pd.DataFrame) -> bytes:
 
 def _unexpected(error: Exception) -> str:
     """Return the message, class and place of an error of another library, in one line."""
+    if user_place := place_in_user_code(error):
+        return one_line(f"{type(error).__name__}: {error} (at {user_place})")
     frames = traceback.extract_tb(error.__traceback__)
     place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "unknown"
     return one_line(f"{type(error).__name__}: {error} (unexpected, at {place})")

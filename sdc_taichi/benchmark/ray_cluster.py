@@ -23,6 +23,7 @@ from sdc_taichi.benchmark.jobs import (
     source_digest,
 )
 from sdc_taichi.errors import ConfigError, RuntimeStateError, one_line
+from sdc_taichi.user_functions import CodePermission, code_permission, set_code_permission
 
 LOCAL = "local"
 """Address that stands for a new cluster on this machine, which ends with the study."""
@@ -93,7 +94,7 @@ class RayCluster(Executor):
                 for name in job.inputs.keys() - references.keys():
                     references[name] = ray.put(inputs[name])
                 contents = [references[name] for name in job.inputs]
-                running[task.remote(job, sys.path, *contents)] = job
+                running[task.remote(job, sys.path, code_permission(), *contents)] = job
             if not running:
                 return
             ended, _ = ray.wait(list(running), timeout=_POLL_S)
@@ -148,15 +149,19 @@ class RayCluster(Executor):
         self._ray.shutdown()
 
 
-def _run(job: Job, path: Sequence[str], *contents: bytes) -> DoneJob:
+def _run(
+    job: Job, path: Sequence[str], permission: CodePermission | None, *contents: bytes
+) -> DoneJob:
     """Run a job in a Ray worker.
 
     Args:
         job: the job.
         path: ``sys.path`` of the driver process, so that the worker finds modules of users.
+        permission: permission of the driver process to run users' code.
         *contents: contents of the job's inputs, in the order of ``job.inputs``.
     """
     compute_in_one_thread()
+    set_code_permission(permission)
     sys.path += [folder for folder in path if folder not in sys.path]
     return run_job(job, dict(zip(job.inputs, contents, strict=True)))
 

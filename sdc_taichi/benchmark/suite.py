@@ -301,12 +301,13 @@ def suite_names() -> list[str]:
     return sorted(x.name[:-5] for x in folder.iterdir() if x.name.endswith(".yaml"))
 
 
-def load_suite(source: str, *, quick: bool = False) -> Suite:
+def load_suite(source: str, *, quick: bool = False, allow_code: bool = False) -> Suite:
     """Read a suite.
 
     Args:
         source: name of a suite in the package, or path of a YAML file.
         quick: True to read the short version of the suite.
+        allow_code: True if import paths ``module:name`` in a file are valid.
 
     Raises:
         ConfigError: a value is not valid; the message names the file, the key, the value and valid
@@ -319,7 +320,7 @@ def load_suite(source: str, *, quick: bool = False) -> Suite:
     else:
         label, name = source, Path(source).stem
         try:
-            values = read_values(source)
+            values = read_values(source, allow_code=allow_code)
         except ConfigError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise

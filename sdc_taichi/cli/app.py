@@ -30,7 +30,8 @@ from sdc_taichi.cli.sweep import sweep_command
 from sdc_taichi.cli.terminal import EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED, warnings_in_lines
 from sdc_taichi.cli.train import train_command
 from sdc_taichi.cli.view import report_command, view_command
-from sdc_taichi.errors import SdcError, one_line
+from sdc_taichi.errors import SdcError, one_line, place_in_user_code
+from sdc_taichi.user_functions import code_permitted_by
 
 _FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon, energy and water.
 
@@ -50,7 +51,7 @@ class _Commands(typer.core.TyperGroup):
         words = sys.argv[1:] if args is None else list(args)
         extra |= {"standalone_mode": False, "obj": words}
         try:
-            with warnings_in_lines():
+            with warnings_in_lines(), code_permitted_by(words):
                 code = super().main(args, *more, **extra)
         except Exception as error:
             if "--debug" in words:
@@ -85,21 +86,18 @@ app.command("report")(report_command)
 app.command("view")(view_command)
 app.command("doctor")(doctor_command)
 app.command("new")(new_command)
-app.command("simulate")(simulate_command)
-app.command("optimum")(optimum_command)
-app.command("train")(train_command)
-app.command("evaluate")(evaluate_command)
-app.command("sweep", cls=JobsCommand)(sweep_command)
-app.command("collect")(collect_command)
+app.command("simulate", may_allow_code=True)(simulate_command)
+app.command("optimum", may_allow_code=True)(optimum_command)
+app.command("train", may_allow_code=True)(train_command)
+app.command("evaluate", may_allow_code=True)(evaluate_command)
+app.command("sweep", cls=JobsCommand, may_allow_code=True)(sweep_command)
+app.command("collect", may_allow_code=True)(collect_command)
 
 
 def main() -> None:
     """Run the command that this process was started with, and exit."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    # Import paths ``module:name`` may refer to modules in the current folder. It comes last, so
-    # that its files cannot hide installed modules.
-    sys.path.append("")
     try:
         app()
     except KeyboardInterrupt:  # outside the part of the program where Typer catches it
@@ -130,19 +128,20 @@ def _options(
 
 def _print_error(error: Exception) -> int:
     """Print an error as one line on stderr, and return the exit code."""
+    place = place_in_user_code(error)
     if isinstance(error, typer.TyperException):
         # The message is empty if Typer has shown the help text because of missing arguments.
         text, code = error.format_message(), error.exit_code
     elif isinstance(error, SdcError):
-        text, code = str(error), EXIT_INPUT
+        text, code = f"{error} (at {place})" if place else str(error), EXIT_INPUT
     elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG):
         _drop_output()
         text, code = f"output cannot be written: {error.strerror}", EXIT_INPUT
     elif isinstance(error, MemoryError):
         text, code = f"memory is short{f' ({error})' if str(error) else ''}", EXIT_FAILURE
     else:
-        text = f"{type(error).__name__}: {error} (unexpected; --debug shows where)"
-        code = EXIT_FAILURE
+        where = f"at {place}" if place else "unexpected; --debug shows where"
+        text, code = f"{type(error).__name__}: {error} ({where})", EXIT_FAILURE
     if line := one_line(text):
         print(f"error: {line}", file=sys.stderr)
     return code

@@ -51,7 +51,7 @@ benchmark_app = CommandApp(
 )
 
 
-@benchmark_app.command(_RUN, cls=JobsCommand)
+@benchmark_app.command(_RUN, cls=JobsCommand, may_allow_code=True)
 def run_command(
     context: typer.Context,
     *,
@@ -163,7 +163,7 @@ def report_command(
         print(f"Tables: {printable(markdown)}")
 
 
-@benchmark_app.command("add")
+@benchmark_app.command("add", may_allow_code=True)
 def add_command(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Results of a row.", show_default=False)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sdc_taichi.sim.design_hall import DesignHall
 
 hall_app = CommandApp(help="Describe a hall, solve its air.", no_args_is_help=True)
-hall_app.command("why")(why_command)
+hall_app.command("why", may_allow_code=True)(why_command)
 
 
 @hall_app.command("show")

@@ -21,6 +21,7 @@ from sdc_taichi.config import DataCenterConfig, load_config, load_yaml, preset_n
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
+from sdc_taichi.user_functions import code_permission, set_code_permission
 
 if TYPE_CHECKING:
     from sdc_taichi.control import ForecastError
@@ -28,31 +29,40 @@ if TYPE_CHECKING:
 CommandFunction = TypeVar("CommandFunction", bound=Callable[..., None])
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
 """Option of every command; the module ``app`` searches the arguments for it after an error."""
+AllowCode = Annotated[
+    bool,
+    typer.Option(
+        "--allow-code",
+        help="Run code that files name by import paths module:name; only if you trust the files.",
+    ),
+]
+"""Option of the commands that can run controllers, rewards or costs that a file names."""
 
 
 class CommandApp(typer.Typer):
     """Set of commands that may have groups of options, and all have the option ``--debug``."""
 
     def command(
-        self, name: str | None = None, **settings: Any
+        self, name: str | None = None, *, may_allow_code: bool = False, **settings: Any
     ) -> Callable[[CommandFunction], CommandFunction]:
         """Register the decorated function as a command.
 
         Args:
             name: name of the command.
+            may_allow_code: True to give the command the option ``--allow-code``.
             settings: further arguments of ``typer.Typer.command``.
         """
         register = super().command(name, **settings)
 
         def decorate(function: CommandFunction) -> CommandFunction:
-            register(_flattened(function))
+            register(_flattened(function, may_allow_code=may_allow_code))
             return function
 
         return decorate
 
 
-def _flattened(function: Callable[..., None]) -> Callable[..., None]:
-    """Wrap the function of a command, replacing each group of options by its fields."""
+def _flattened(function: Callable[..., None], *, may_allow_code: bool) -> Callable[..., None]:
+    """Wrap the function of a command: replace groups of options by fields, add shared options."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
@@ -62,14 +72,17 @@ def _flattened(function: Callable[..., None]) -> Callable[..., None]:
             parameters += _parameters_of(group)
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-    debug = inspect.Parameter(
-        "debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug
-    )
-    parameters.append(debug)
+    shared = {"allow_code": AllowCode} if may_allow_code else {}
+    for name, option in (shared | {"debug": Debug}).items():
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(name, keyword, default=False, annotation=option))
 
     @functools.wraps(function)
     def command(**values: Any) -> None:
         del values["debug"]
+        permission = code_permission()
+        if values.pop("allow_code", False) and permission is not None:
+            set_code_permission(permission._replace(any_code=True))
         for name, group in groups.items():
             fields = dataclasses.fields(group)
             values[name] = group(**{field.name: values.pop(field.name) for field in fields})

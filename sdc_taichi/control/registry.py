@@ -25,11 +25,17 @@ from sdc_taichi.control.rules import (
     commands_of,
 )
 from sdc_taichi.control.view import limits_of
-from sdc_taichi.errors import ConfigError, shortened, suggestion, suggestion_or_valid
+from sdc_taichi.errors import (
+    ConfigError,
+    place_in_user_code,
+    shortened,
+    suggestion,
+    suggestion_or_valid,
+)
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.optimum.problem import AGENTS, Agent
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.user_functions import function_named, import_path, register_function
+from sdc_taichi.user_functions import check_code, import_path, imported, register_function
 
 CONTROLLABLE: tuple[Agent, ...] = AGENTS
 """Valid parts of a controller spec such as ``load=NAME``, named like commands of ``Actions``."""
@@ -100,15 +106,21 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
     register_function("controller", name, maker, _registered, reserved=_BUILT_IN)
 
 
-def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = True) -> Controller:
+def is_path(name: str) -> bool:
+    """Return True if a controller's name is an import path, False if it begins with a name."""
+    kind, colon, _ = name.partition(":")
+    return bool(colon) and kind not in (*_registered, "constant") and not is_mpc(name)
+
+
+def make_controller(spec: str | Controller, fleet: Fleet, *, allow_code: bool = True) -> Controller:
     """Make a controller from a spec, or copy a controller.
 
     Args:
         spec: Name of a controller; ``agent=name`` parts joined by commas, such as
             ``load=greedy-ci,cooling=g36``, where all other agents stay idle; or a controller.
         fleet: Data centers to control.
-        imports: True if import paths ``module:name`` are valid. Specs in files must not import
-            code, because files may come from an untrusted source.
+        allow_code: True if import paths ``module:name`` are valid; False for a spec of a file,
+            which may come from an untrusted source. In a command, the command line decides.
 
     Raises:
         ConfigError: An agent or name is unknown, a controller does not act on its agent, a constant
@@ -119,12 +131,12 @@ def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = Tru
         return _copy(spec)
     named = parts_of(spec)
     if not named:
-        return _make(spec.strip(), fleet, None, imports)
+        return _make(spec.strip(), fleet, None, allow_code)
     controllers: dict[str, Controller] = {}
     for name in dict.fromkeys(named.values()):
         # Parts with the same name share one controller, so that a plan covers them together.
         parts = tuple(part for part in CONTROLLABLE if named.get(part) == name)
-        controllers |= dict.fromkeys(parts, _make(name, fleet, parts, imports))
+        controllers |= dict.fromkeys(parts, _make(name, fleet, parts, allow_code))
     return PerAgent(*(controllers.get(part, Idle()) for part in CONTROLLABLE))
 
 
@@ -201,7 +213,7 @@ def _copy(given: Any) -> Controller:
         ) from None
 
 
-def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool) -> Controller:
+def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, allow_code: bool) -> Controller:
     """Make a controller by name, for the ``parts`` of a spec; None stands for a plain name."""
     if is_mpc(name):
         return model_predictive(name, parts or CONTROLLABLE)
@@ -211,7 +223,7 @@ def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: boo
     elif name in _CONTROLLERS:
         entry = _CONTROLLERS[name]
     else:
-        return _made_by_maker(name, fleet, parts, imports)
+        return _made_by_maker(name, fleet, parts, allow_code)
     agent = _first_missing(parts, entry.parts)
     if agent is not None:
         able = [n for n, e in _CONTROLLERS.items() if agent in e.parts]
@@ -228,21 +240,18 @@ def _first_missing(parts: tuple[Agent, ...] | None, valid: Sequence[str]) -> Age
 
 
 def _made_by_maker(
-    name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool
+    name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, allow_code: bool
 ) -> Controller:
     """Make a controller with a registered maker, or with one whose import path is ``name``."""
     kind, _, text = name.partition(":")
     maker = _registered.get(kind)
     if maker is None:
         attribute, _, rest = text.partition(":")
-        is_path = all(part.isidentifier() for part in (*kind.split("."), attribute))
-        if is_path and not imports:
-            raise ConfigError(
-                f"controller {name!r}: is an import path, and code that a file names is not run; "
-                "valid is a name that register_controller gave it"
-            )
-        if is_path and ("." in kind or kind in sys.modules or importlib.util.find_spec(kind)):
-            maker, text = f"{kind}:{attribute}", rest
+        if all(part.isidentifier() for part in (*kind.split("."), attribute)):
+            path, known = f"{kind}:{attribute}", ", ".join(controller_names())
+            check_code(f"controller {name!r}", path, valid=known, allow_code=allow_code)
+            if "." in kind or kind in sys.modules or importlib.util.find_spec(kind):
+                maker, text = path, rest
     if maker is None:
         valid = controller_names()
         meant = suggestion(name, valid, _SUGGESTION)
@@ -251,13 +260,15 @@ def _made_by_maker(
             f"module:name{meant}"
         )
     if isinstance(maker, str):
-        maker = function_named("controller", maker, {}, valid="a name of --controller")
+        maker = imported("controller", maker)
     if isinstance(maker, type):
         if text:
             raise ConfigError(f"controller {name!r}: {maker.__name__} takes no text; valid is none")
         try:
             made = maker()
         except TypeError as error:
+            if place_in_user_code(error):
+                raise
             raise ConfigError(
                 f"controller {name!r}: {error}; valid is a class that needs no arguments, or a "
                 "function of the text after the name, the fleet, and the agents it is named for"

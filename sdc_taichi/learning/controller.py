@@ -33,6 +33,7 @@ class PolicyController:
         name: name of the controller in messages.
         others: name of the controller of the agents without a network; None selects the controller
             that was used in the training.
+        allow_code: True if that name may be an import path; the policy's file names it.
 
     Attributes:
         policy: the policy.
@@ -43,15 +44,27 @@ class PolicyController:
     """
 
     def __init__(
-        self, policy: Policy, fleet: Fleet, name: str = "policy", others: str | None = None
+        self,
+        policy: Policy,
+        fleet: Fleet,
+        name: str = "policy",
+        others: str | None = None,
+        *,
+        allow_code: bool = False,
     ) -> None:
-        self.policy, self._name = policy, name
+        self.policy, self._name, self._allow_code = policy, name, allow_code
         self._named_others = policy.about.others if others is None else others
         self._prepare(fleet)
 
     def __deepcopy__(self, _: Any) -> PolicyController:
         """Return a new controller with the same policy object (policies are immutable)."""
-        return PolicyController(self.policy, self._fleet, self._name, self._named_others)
+        return PolicyController(
+            self.policy,
+            self._fleet,
+            self._name,
+            self._named_others,
+            allow_code=self._allow_code,
+        )
 
     def _prepare(self, fleet: Fleet) -> None:
         """Build everything that depends on the data centers."""
@@ -60,7 +73,7 @@ class PolicyController:
         self._fleet = fleet
         self._decoder = AgentActions(fleet, interface.options())
         try:
-            self._others = make_controller(others, fleet, imports=False)
+            self._others = make_controller(others, fleet, allow_code=self._allow_code)
         except SdcError as error:
             raise ConfigError(f"{self._name}: others of its training: {error}") from None
         decided = self._decoder.commands

@@ -439,7 +439,7 @@ def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
         ConfigError: settings are not valid, or the trainings have different data centers.
     """
     trainings = [folder for folder in folders if (folder / SETTINGS_FILE).is_file()]
-    settings = [settings_of(folder) for folder in trainings]
+    settings = [settings_of(folder, allow_code=True) for folder in trainings]
     for folder, other in zip(trainings[1:], settings[1:], strict=True):
         for name in ("config", "overrides"):
             if getattr(other, name) != getattr(settings[0], name):
@@ -480,7 +480,7 @@ def _key(folder: Path, policy: Policy) -> str:
     about = policy.about.model_dump(exclude={"seed", "fingerprint"})
     settings = {}
     if (folder / SETTINGS_FILE).is_file():
-        settings = settings_of(folder).model_dump(mode="json", exclude={"seed"})
+        settings = settings_of(folder, allow_code=True).model_dump(mode="json", exclude={"seed"})
         about.pop("steps")  # differs by seed: the best policy may come from any update
     return json.dumps([about, policy.interface.model_dump(), settings], sort_keys=True)
 

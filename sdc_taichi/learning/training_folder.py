@@ -60,7 +60,7 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
             out.mkdir(parents=True, exist_ok=True)
         others = [name for name in list_folder(out) if not name.startswith(".")]
     if resume:
-        different = settings_of(out).difference(settings)
+        different = settings_of(out, allow_code=True).difference(settings)
         if different is not None:
             raise ConfigError(
                 f"{out}: was trained with {different}; valid is to resume with its settings, or "
@@ -90,15 +90,20 @@ def write_settings(folder: Path, settings: TrainingSettings) -> None:
         file.write(settings.to_yaml().encode())
 
 
-def settings_of(folder: Path) -> TrainingSettings:
+def settings_of(folder: Path, *, allow_code: bool = False) -> TrainingSettings:
     """Read the settings of the training in a folder.
+
+    Args:
+        folder: the folder.
+        allow_code: True if import paths ``module:name`` in the settings are valid, as they are
+            where no environment is created from the settings.
 
     Raises:
         ConfigError: the folder contains no training, or the settings are not valid.
     """
     if not (folder / SETTINGS_FILE).is_file():
         raise ConfigError(f"{folder}: holds no training; valid is a folder that train has written")
-    return load_settings(folder / SETTINGS_FILE)
+    return load_settings(folder / SETTINGS_FILE, allow_code=allow_code)
 
 
 UPDATE = "update"

@@ -30,6 +30,7 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.config.fields import Section
+from sdc_taichi.control.registry import is_path
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
@@ -44,6 +45,7 @@ from sdc_taichi.learning.split import (
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
+from sdc_taichi.user_functions import check_file_names
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
 """Sites (US states) of the data centers in every scenario."""
@@ -385,28 +387,35 @@ def make_settings(values: Mapping[str, Any], label: str = "settings") -> Trainin
     return validated(TrainingSettings, values, label)
 
 
-def load_settings(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingSettings:
+def load_settings(
+    path: str | os.PathLike[str], overrides: Sequence[str] = (), *, allow_code: bool = False
+) -> TrainingSettings:
     """Read settings from a YAML file.
 
     Args:
         path: the file.
         overrides: assignments ``a.b=c``, which take precedence over the file.
+        allow_code: True if import paths ``module:name`` in the file are valid.
 
     Raises:
         ConfigError: a setting is not valid; the message names the file, the setting, its value and
             valid values.
     """
-    values = read_values(path)
+    values = read_values(path, allow_code=allow_code)
     for override in overrides:
         apply_override(values, override)
     return make_settings(values, str(path))
 
 
-def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_values(path: str | os.PathLike[str], *, allow_code: bool = False) -> dict[str, Any]:
     """Read plain values from a YAML file of settings, without checking the settings.
 
+    Args:
+        path: the file.
+        allow_code: True if import paths ``module:name`` in the file are valid.
+
     Raises:
-        ConfigError: the file does not exist, or is not valid YAML.
+        ConfigError: the file does not exist, is not valid YAML, or names code.
     """
     try:
         values = load_yaml(read_text(path, MOST_CONFIG_BYTES, ConfigError))
@@ -418,6 +427,7 @@ def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ConfigError(
             f"{path}: the top level is a {type(values).__name__}; valid is a mapping of settings"
         )
+    check_file_names(values, path, is_path=is_path, allow_code=allow_code)
     return values
 
 

@@ -9,6 +9,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import make_controller
 from sdc_taichi.errors import ConfigError, OddInputWarning, SdcError, shortened
 from sdc_taichi.run.folder_reader import RunFolder, read_configs, read_hottest_air, read_steps
+from sdc_taichi.run.folder_writer import METRICS_FILE
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.steps_file import air_from_values
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -65,7 +66,7 @@ def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
     return InletsAtStep(hottest.step, hottest_c, fleet.configs[0], Inlets(fleet, 0, hottest.air))
 
 
-def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
+def inlets_at_step(run: RunFolder, dc: int, step: int, *, allow_code: bool = False) -> InletsAtStep:
     """Compute the inlets of a data center in a step by simulating the run again up to that step.
 
     The data center is simulated alone, with controller, seed, precision and input files of the run,
@@ -75,6 +76,7 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
         run: The run.
         dc: Index of the data center.
         step: Index of the step, counted from 0 at reset.
+        allow_code: True if the run's controller may be an import path.
 
     Raises:
         SdcError: The step does not exist, the controller is not available by name, an input file is
@@ -85,10 +87,14 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
         raise ConfigError(f"step {step}: valid is 0..{metrics['steps_done'] - 1} of {run.path}")
     fleet = _fleet_of(run, dc)
     results: list[StepResult] = []
+    try:
+        controller = make_controller(metrics["controller"], fleet, allow_code=allow_code)
+    except SdcError as error:
+        raise ConfigError(f"{run.path / METRICS_FILE}: {error}") from None
     with Simulator(fleet, precision=metrics["precision"]) as sim:
         simulate(
             sim,
-            make_controller(metrics["controller"], fleet, imports=False),
+            controller,
             metrics["steps_asked"],
             metrics["seed"],
             on_step=lambda result: results.__setitem__(slice(None), [result]),
