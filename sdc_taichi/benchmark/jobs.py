@@ -58,6 +58,10 @@ class Job:
     inputs: Mapping[str, str] = field(default_factory=dict)
     """Identity of each input that the function reads, by name: the digest of its content, or the
     key of the job that creates it."""
+    check: Callable[[Mapping[str, Any], Mapping[str, Any], bytes], None] | None = None
+    """Function that takes the values, stored metrics and the content of a Parquet file, which is
+    empty without rows, and raises ``SdcError`` if they cannot be a result of the job; None checks
+    nothing."""
 
     @property
     def name(self) -> str:

@@ -15,13 +15,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from urllib.parse import quote
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sdc_taichi.atomic_file import FileClaim, atomic_write, naming_errors
 from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, digest_of, source_digest
+from sdc_taichi.config import load_json
 from sdc_taichi.config.fields import explain
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.learning.training_settings import leaves
@@ -38,6 +39,15 @@ MOST_FILE_BYTES = 2_000_000_000
 """Maximum size of a result file, in bytes."""
 _MOST_SEGMENT_BYTES = 255  # maximum length of a file name in common file systems
 _MOST_DIFFERENCES = 3
+
+
+def _checked_file_name(name: str) -> str:
+    """Return the path of a file in a job's folder after ``check_file_name``."""
+    try:
+        check_file_name(name)
+    except SdcError as error:
+        raise ValueError(str(error)) from None
+    return name
 
 
 class Record(BaseModel):
@@ -90,11 +100,11 @@ class ResultRecord(Record):
     """Digest of the source files of the package."""
     rows_sha256: str
     """Digest of the Parquet file with the table rows; empty if the job has no rows."""
-    files_sha256: dict[str, str]
+    files_sha256: dict[Annotated[str, AfterValidator(_checked_file_name)], str]
     """Digest of each further file, by path relative to the job's folder."""
     metrics: dict[str, Any]
     """Metrics of the job as a whole."""
-    core_s: float
+    core_s: Annotated[float, Field(ge=0.0, le=1e12)]
     """Processor time of the job, in s."""
     processor: dict[str, Any]
     """Properties of processor and libraries that affect the last bits of the result."""
@@ -226,11 +236,16 @@ class ResultStore:
         return content
 
     def is_done(self, job: Job) -> bool:
-        """Return True if the result of a job exists with all files undamaged."""
+        """Return True if a valid result of a job exists with all files undamaged."""
         try:
             record = self.result(job.partition)
-            is_of_job = (record.key, record.partition) == (job.key, dict(job.partition))
-            return is_of_job and self.is_whole(record)
+            stored = record.key, record.function, record.values, record.inputs, record.partition
+            values = json.loads(json.dumps(job.values))
+            if stored != (job.key, job.function, values, dict(job.inputs), dict(job.partition)):
+                return False
+            if job.check is not None:
+                job.check(values, record.metrics, self.rows_file(record))
+            return self.is_whole(record)
         except SdcError:
             return False
 
@@ -297,33 +312,43 @@ class ResultStore:
             _write(rows_path, rows)
         write_record(folder / METRICS_FILE, record)
 
-    def rows(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
+    def rows(
+        self, columns: Sequence[str] | None = None, numbers: Sequence[str] = ()
+    ) -> pd.DataFrame:
         """Read the table rows of all jobs that are done, with the columns of their partitions.
 
         Args:
             columns: names of the columns to read; None selects all columns.
+            numbers: names of columns that must contain numbers.
 
         Raises:
-            SdcError: there are no rows, or a file is damaged.
+            SdcError: there are no rows, no file has a column, or a file is damaged.
         """
-        import pyarrow as pa
-        import pyarrow.dataset as ds
+        import pandas as pd
 
-        base = self.folder / RESULTS
-        paths = [str(self.rows_path(x.partition)) for x in self.results() if x.rows_sha256]
-        if not paths:
+        from sdc_taichi.benchmark.result_table import NUMBER, read_any_rows
+
+        declared = dict.fromkeys(numbers, NUMBER)
+        frames = []
+        partition_columns: dict[str, None] = {}
+        for record in self.results():
+            if record.rows_sha256:
+                content, path = self.rows_file(record), self.rows_path(record.partition)
+                frame = read_any_rows(content, path, columns, declared)
+                for name, value in record.partition.items():
+                    frame[name] = value
+                frames.append(frame)
+                partition_columns |= dict.fromkeys(record.partition)
+        if not frames:
             raise ConfigError(f"{self.folder}: holds no rows; valid is the folder of a study")
-        try:
-            hive = ds.HivePartitioning.discover(infer_dictionary=False)
-            dataset = ds.dataset(paths, partitioning=hive, partition_base_dir=str(base))
-            # Unify the schemas, because a dataset takes the schema of its first file.
-            schemas = [fragment.physical_schema for fragment in dataset.get_fragments()]
-            schema = pa.unify_schemas([dataset.schema, *schemas], promote_options="permissive")
-            table = dataset.replace_schema(schema).to_table(columns)
-        except (pa.ArrowException, OSError) as error:
-            raise ConfigError(f"{base}: cannot be read as a dataset: {error}") from error
-        frame: pd.DataFrame = table.to_pandas()
-        return frame
+        rows = pd.concat(frames, ignore_index=True)
+        for name in partition_columns:
+            if rows[name].str.fullmatch("[0-9]{1,9}").all():
+                rows[name] = rows[name].astype("int64")
+        for name in columns or ():
+            if name not in rows:
+                raise ConfigError(f"{self.folder}: column {name} is missing in all tables")
+        return rows if columns is None else rows[list(columns)]
 
     def _begun_study(self, *, resume: bool) -> Study | None:
         """Return the study in the folder; None if the folder is empty or does not exist.
@@ -416,9 +441,13 @@ def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
     """
     text = read_text(path, MOST_METRICS_BYTES, ConfigError)
     try:
-        return model.model_validate_json(text)
+        record = model.model_validate_json(text)
+        load_json(text)  # refuses numbers that are not finite, and keys that exist twice
     except ValidationError as error:
         raise ConfigError(explain(error, str(path), model)) from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return record
 
 
 def write_record(path: Path, record: Record) -> None:

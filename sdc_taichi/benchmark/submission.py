@@ -19,6 +19,7 @@ import numpy as np
 from sdc_taichi.atomic_file import FileClaim, naming_errors
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, parquet
+from sdc_taichi.benchmark.result_table import METRIC_COLUMNS
 from sdc_taichi.benchmark.store import JOBS, METRICS_FILE, ResultStore, read_record, write_record
 from sdc_taichi.benchmark.suite import REFERENCE
 from sdc_taichi.benchmark.suite_results import (
@@ -53,7 +54,6 @@ ROW_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,79}")
 _SAME = 1e-3
 """Maximum relative difference between submitted and repeated results. Rounding differs between
 processors, and policies amplify it."""
-_NEEDED = ("figure", "idle_figure", "cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "water_l")
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,12 +305,13 @@ def _check_case(submission: Submission, seeds: int, case: CaseResults) -> None:
             f"{place}: seeds {', '.join(str(x.seed) for x in results)}; valid are {needed} of "
             "them, from 0, as of the suite"
         )
-    check_weeks(case.name, {**case.rows, submission.row: results})
+    check_weeks(case.name, case.settings.weeks, {**case.rows, submission.row: results})
     for result in results:
         whole = result.frame[result.frame["moves"] == ALL]
-        for name in _NEEDED:
-            if name not in whole or not np.isfinite(whole[name].to_numpy(np.float64)).all():
-                raise ConfigError(f"{place}: column {name}; valid is a finite number in each row")
+        for name in METRIC_COLUMNS:
+            if whole[name].isna().any():
+                path = submission.store.rows_path(result.record.partition)
+                raise ConfigError(f"{path}: column {name}; valid is a finite number in each row")
 
 
 def _idle_differs(rows: Sequence[Sequence[RowResult]]) -> bool:

@@ -25,9 +25,14 @@ from sdc_taichi.benchmark.cases import (
     weeks_of,
 )
 from sdc_taichi.benchmark.jobs import Inputs, JobResult
+from sdc_taichi.benchmark.result_table import read_suite_rows
+from sdc_taichi.benchmark.store import METRICS_FILE, ROWS_FILE, Record
 from sdc_taichi.benchmark.suite import Case, Part, Row
+from sdc_taichi.benchmark.suite_results import RowMetrics
+from sdc_taichi.config import validated
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import (
     ALL,
     METRICS,
@@ -126,6 +131,52 @@ def packed(files: Mapping[str, bytes]) -> bytes:
         for name in sorted(files):
             archive.writestr(zipfile.ZipInfo(name), files[name])
     return out.getvalue()
+
+
+class _SolvedMetrics(Record):
+    """Metrics of a job that computed the optima of a site's weeks, one entry per week."""
+
+    part: Part
+    site: str
+    weeks: list[int]
+    idle_figure: list[float]
+    achieved_figure: list[float]
+    bound_figure: list[float | None]
+    bound_kinds: list[str]
+
+
+def check_reference(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
+    """Check metrics and table rows that are stored for ``solve_reference``.
+
+    Args:
+        metrics: the metrics.
+        rows: the table rows, which must be empty.
+
+    Raises:
+        SdcError: a metric is missing or of another type, or there are rows.
+    """
+    validated(_SolvedMetrics, metrics, METRICS_FILE)
+    if rows:
+        raise ConfigError(f"{ROWS_FILE}: valid is a job of optima without rows")
+
+
+def check_row(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
+    """Check metrics and table rows that are stored for ``run_row``.
+
+    Args:
+        values: values of the job.
+        metrics: the metrics.
+        rows: content of the Parquet file with the table rows.
+
+    Raises:
+        SdcError: a metric or value is missing or not valid, or rows are of other weeks.
+    """
+    validated(RowMetrics, metrics, METRICS_FILE)
+    if values["row"]["best_of"] is not None and metrics.get("chosen") is None:
+        raise ConfigError(f"{METRICS_FILE}: chosen: missing")
+    frame = read_suite_rows(rows, Path(ROWS_FILE))
+    if frame["week"].unique().tolist() != values["case"]["weeks"]:
+        raise ConfigError(f"{ROWS_FILE}: column week; valid are the weeks of the case")
 
 
 class _Task(BaseModel):

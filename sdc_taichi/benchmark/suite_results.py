@@ -6,7 +6,6 @@ therefore be compared if they have the same weeks of the same data centers.
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,13 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from sdc_taichi.benchmark.store import STUDY_FILE, Record, ResultRecord, ResultStore, read_record
+from sdc_taichi.benchmark.result_table import read_suite_rows
+from sdc_taichi.benchmark.store import (
+    METRICS_FILE,
+    STUDY_FILE,
+    Record,
+    ResultRecord,
+    ResultStore,
+    read_record,
+)
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
 from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.user_file import decoding
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,10 +41,18 @@ SUBMISSION_FILE = "submission.json"
 """Name of the file with the author of a submitted row."""
 COLUMNS = ("suite", "case", "row", "seed")
 """Columns that identify a result of a suite (its partition)."""
-_NEEDED = ("moves", "site", "week", "figure", "valued_figure", "idle_figure", "achieved_figure")
 _SAME = 1e-6
 """Maximum relative difference of idle commands' objective between results of the same weeks."""
 _Text = Annotated[str, Field(max_length=1000)]
+
+
+class RowMetrics(Record):
+    """Metrics of a result of a row that others read; results of other software have none."""
+
+    chosen: _Text | None = None
+    """Name of the controller that was chosen in the validation weeks."""
+    forecast_error: _Text | None = None
+    """Errors of the forecasts in the held-out weeks; None for perfect forecasts."""
 
 
 class SubmissionRecord(Record):
@@ -55,15 +69,6 @@ class SubmissionRecord(Record):
     kind: Literal["learner", "controller"]
     """Kind of the row: ``learner`` for a trained method with all seeds of the suite, ``controller``
     for any other."""
-
-
-class _SolvedWeeks(Record):
-    """Metrics of a job that computed the optima of a site's weeks."""
-
-    part: str
-    site: str
-    weeks: list[int]
-    bound_figure: list[float | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +127,6 @@ class CaseResults:
     last."""
     missing: tuple[str, ...]
     """Planned results that do not exist yet, as ``ROW, seed SEED``."""
-    bound: Mapping[tuple[str, int], float]
-    """Bound of the objective by site and week, where it is known."""
     optima_core_s: float
     """Processor time for computing the optima of the case, in s."""
 
@@ -206,14 +209,9 @@ def read_result(store: ResultStore, record: ResultRecord) -> RowResult:
     Raises:
         SdcError: a file is missing or damaged, or does not contain results of a suite.
     """
-    import pandas as pd
-
-    path = store.rows_path(record.partition)
-    with decoding(path, "a Parquet file"):
-        frame = pd.read_parquet(io.BytesIO(store.rows_file(record)))
-    lacking = [name for name in _NEEDED if name not in frame.columns]
-    if lacking or frame.empty:
-        raise ConfigError(f"{path}: no {', '.join(lacking) or 'rows'}; valid are rows of a suite")
+    place = store.folder_of(record.partition) / METRICS_FILE
+    validated(RowMetrics, record.metrics, f"{place}: metrics")
+    frame = read_suite_rows(store.rows_file(record), store.rows_path(record.partition))
     about = store.folder_of(record.partition).parent / SUBMISSION_FILE
     submission = read_record(about, SubmissionRecord) if about.exists() else None
     return RowResult(store, record, frame, submission)
@@ -263,16 +261,24 @@ def check_partition(partition: Mapping[str, str]) -> None:
         ConfigError: the columns are not ``COLUMNS``, or the seed is not a whole number.
     """
     if set(partition) != set(COLUMNS):
-        raise ConfigError(f"partition {dict(partition)}: valid columns are {', '.join(COLUMNS)}")
+        raise ConfigError(
+            f"partition {shortened(partition)}: valid columns are {', '.join(COLUMNS)}"
+        )
     if not re.fullmatch("0|[1-9][0-9]{0,5}", partition["seed"]):
-        raise ConfigError(f"partition {dict(partition)}: seed; valid is a whole number")
+        raise ConfigError(
+            f"partition {shortened(partition)}: seed {shortened(partition['seed'])}; valid is a "
+            "whole number"
+        )
 
 
-def check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
+def check_weeks(
+    case: str, weeks_of_case: Sequence[int], rows: Mapping[str, Sequence[RowResult]]
+) -> None:
     """Check that all rows of a case have the same weeks of the same data centers.
 
     Args:
         case: name of the case.
+        weeks_of_case: weeks of the year of the case.
         rows: results of each row by seed.
 
     Raises:
@@ -280,9 +286,16 @@ def check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
     """
     first_of_seed: dict[int, pd.DataFrame] = {}
     first = next(iter(rows.values()))[0]
+    index = _weeks(first).index
+    other_weeks = set(index.unique("week")) - set(weeks_of_case)
+    if other_weeks:
+        raise ConfigError(
+            f"{first.folder}: has rows of week {min(other_weeks)}; valid are weeks "
+            f"{', '.join(map(str, weeks_of_case))} of case {case}"
+        )
     for result in (result for results in rows.values() for result in results):
         weeks = _weeks(result)
-        if not weeks.index.equals(_weeks(first).index):
+        if not weeks.index.equals(index):
             raise ConfigError(
                 f"{result.folder}: is of other sites or weeks than {first.folder}, of the same "
                 f"case {case}; valid are equal ones"
@@ -334,7 +347,7 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
             continue
         order = [*(row for row in suite.rows if row in of_case), *of_case]
         results = {row: [x for _, x in sorted(of_case[row].items())] for row in order}
-        check_weeks(name, results)
+        check_weeks(name, suite.cases[name].weeks, results)
         solved = [x for x in references if x.partition["case"] == name]
         cases[name] = CaseResults(
             suite=suite.name,
@@ -347,7 +360,6 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
                 for row, seed in wanted.get(name, ())
                 if seed not in of_case.get(row, {})
             ),
-            bound=_bounds(solved),
             optima_core_s=sum(x.core_s for x in solved),
         )
     if not cases:
@@ -372,15 +384,3 @@ def _add(by_seed: dict[int, RowResult], result: RowResult) -> None:
             f"{result.folder} and {other.folder}: hold other results of one seed of one row; valid "
             "is one of them"
         )
-
-
-def _bounds(references: Sequence[ResultRecord]) -> dict[tuple[str, int], float]:
-    """Return the bound of the objective by site and week, from jobs that computed optima."""
-    bounds: dict[tuple[str, int], float | None] = {}
-    for record in references:
-        name = f"metrics.json of {'/'.join(record.partition.values())}"
-        solved = validated(_SolvedWeeks, record.metrics, name)
-        if solved.part == "held-out":
-            keys = ((solved.site, week) for week in solved.weeks)
-            bounds |= dict(zip(keys, solved.bound_figure, strict=False))
-    return {key: bound for key, bound in bounds.items() if bound is not None}

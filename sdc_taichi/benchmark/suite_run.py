@@ -11,7 +11,7 @@ from sdc_taichi.benchmark.executors import JobSummary
 from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, input_paths, read_input
 from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
-from sdc_taichi.benchmark.suite_jobs import packed
+from sdc_taichi.benchmark.suite_jobs import check_reference, check_row, packed
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.learning.policy import WEIGHTS
 
@@ -82,7 +82,9 @@ def reference_jobs(suite: Suite) -> list[Job]:
                     "row": f"{REFERENCE}-{part}-{config.name}",
                     "seed": "0",
                 }
-                jobs.append(Job(f"{_FUNCTIONS}:solve_reference", values, partition))
+                jobs.append(
+                    Job(f"{_FUNCTIONS}:solve_reference", values, partition, check=check_reference)
+                )
     return jobs
 
 
@@ -118,7 +120,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                 if policies:
                     values["policies"] = policies
                 partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
-                jobs.append(Job(f"{_FUNCTIONS}:run_row", values, partition, inputs))
+                jobs.append(Job(f"{_FUNCTIONS}:run_row", values, partition, inputs, check_row))
     return jobs
 
 

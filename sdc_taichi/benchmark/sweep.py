@@ -12,7 +12,7 @@ import itertools
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import prod
 from pathlib import Path
@@ -29,6 +29,14 @@ from sdc_taichi.benchmark.jobs import (
     input_paths,
     read_input,
 )
+from sdc_taichi.benchmark.result_table import (
+    ANY,
+    METRIC_COLUMNS,
+    NUMBER,
+    Column,
+    read_any_rows,
+)
+from sdc_taichi.benchmark.store import METRICS_FILE, ROWS_FILE, Record, ResultStore
 from sdc_taichi.benchmark.vary import (
     Grid,
     Kind,
@@ -39,7 +47,7 @@ from sdc_taichi.benchmark.vary import (
     value_at,
     value_text,
 )
-from sdc_taichi.config import DataCenterConfig, config_from_dict, with_values
+from sdc_taichi.config import DataCenterConfig, config_from_dict, validated, with_values
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
 from sdc_taichi.errors import ConfigError, OddInputWarning, SdcError
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, DAYS_PER_YEAR, whole_steps
@@ -59,6 +67,13 @@ MOST_DCS, MOST_RACKS = 1024, 2**18
 """Default maximum of data centers per job, and of the racks of all of them. Larger batches need
 more memory without being faster."""
 _CONFIG, _FILE = "config", "file "
+_COLUMNS: Mapping[Kind, Column] = {
+    "int64": Column("whole number", low=-1e20, high=1e20),
+    "float64": NUMBER,
+    "bool": ANY,
+    "text": Column("text", may_lack=True),
+}
+"""Valid values of varied fields, by type."""
 _TRIED = 100
 """Number of combinations to check before a sweep begins; at least one of them must be valid."""
 
@@ -127,6 +142,24 @@ class Sweep:
             "precision": self.precision,
             "batch": self.part_size,
         }
+
+
+class FailedCombination(Record):
+    """Combination of a sweep without a result."""
+
+    combination: str
+    """Fields with their values."""
+    error: str
+    """Error message."""
+
+
+class PartMetrics(Record):
+    """Metrics of a job of a sweep."""
+
+    failed: list[FailedCombination]
+    """Combinations whose run failed."""
+    notes: list[str]
+    """Remarks on inputs."""
 
 
 def combinations(sweep: Sweep) -> Iterator[tuple[Any, ...]]:
@@ -210,7 +243,7 @@ def sweep_jobs(sweep: Sweep, inputs: Inputs) -> Iterator[Job]:
                 named = {"controller": controller, "month": str(month), "part": str(part)}
                 if not month:
                     del named["month"]
-                yield Job("sdc_taichi.benchmark.sweep:run_part", values, named, digests)
+                yield Job("sdc_taichi.benchmark.sweep:run_part", values, named, digests, check_part)
 
 
 def sweep_inputs(sweep: Sweep) -> dict[str, bytes]:
@@ -285,6 +318,49 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
     ]
     notes = list(dict.fromkeys(map(with_names, notes)))
     return JobResult(_rows(values, outcomes), {"failed": failed, "notes": notes})
+
+
+def check_part(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
+    """Check metrics and table rows that are stored for ``run_part``.
+
+    Args:
+        values: values of the job.
+        metrics: the metrics.
+        rows: content of the Parquet file with the table rows; empty if all combinations failed.
+
+    Raises:
+        SdcError: a metric or value is missing or not valid, or the number of rows is another one.
+    """
+    part = validated(PartMetrics, metrics, METRICS_FILE)
+    declared = {field: _COLUMNS[kind] for field, kind in values["columns"]}
+    declared["site"] = Column("text")
+    count = 0
+    if rows:
+        frame = read_any_rows(rows, Path(ROWS_FILE), declared=declared, other=NUMBER)
+        for name in {**declared, **METRIC_COLUMNS}:
+            if name not in frame:
+                raise ConfigError(f"{ROWS_FILE}: no column {name}; valid is a table with it")
+        count = len(frame)
+    expected = len(values["cells"]) - len(part.failed)
+    if count != expected:
+        raise ConfigError(
+            f"{ROWS_FILE}: {count} rows; valid are {expected}, as {METRICS_FILE} says"
+        )
+
+
+def stored_metrics(store: ResultStore, jobs: Iterable[Job]) -> Iterator[tuple[int, PartMetrics]]:
+    """Yield number of runs and metrics of each job of a sweep that has a valid result.
+
+    Args:
+        store: storage of the results.
+        jobs: jobs of the sweep.
+    """
+    for job in jobs:
+        try:
+            metrics = store.result(job.partition).metrics
+            yield len(job.values["cells"]), validated(PartMetrics, metrics, METRICS_FILE)
+        except SdcError:
+            continue  # The job is not done, and --resume runs it again.
 
 
 def metric_names(config: DataCenterConfig) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ from sdc_taichi.cli.terminal import EXIT_FAILURE, first_lines, print_notes, prin
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
 if TYPE_CHECKING:
+    from sdc_taichi.benchmark.jobs import Job
     from sdc_taichi.benchmark.store import ResultStore
     from sdc_taichi.benchmark.sweep import Sweep
     from sdc_taichi.config import DataCenterConfig
@@ -132,7 +134,7 @@ def sweep_command(
     study = Study(kind="sweep", command=command, settings=sweep.settings(), partitions=partitions)
     with job_session(store, study, jobs, quiet=quiet) as under_way:
         under_way.run("sweep", sweep_jobs(sweep, inputs), len(partitions), inputs)
-        done, failed = _print_failures(store)
+        done, failed = _print_failures(store, sweep_jobs(sweep, inputs))
         if under_way.is_whole:
             if not quiet:
                 place = printable(folder / RESULTS)
@@ -225,20 +227,26 @@ def _default_folder(label: str, sweep: Sweep) -> Path:
     return Path("sweeps") / "-".join([Path(label).stem, *fields])
 
 
-def _print_failures(store: ResultStore) -> tuple[int, int]:
+def _print_failures(store: ResultStore, jobs: Iterable[Job]) -> tuple[int, int]:
     """Print the distinct reasons for failed runs on stderr.
+
+    Args:
+        store: folder of the results of the sweep.
+        jobs: jobs of the sweep.
 
     Returns:
         Number of runs with results, and number of failed runs in finished jobs.
     """
+    from sdc_taichi.benchmark.sweep import stored_metrics
+
     runs = 0
     reasons: dict[str, list[str]] = {}
     notes: dict[str, None] = {}
-    for result in store.results():
-        runs += len(result.values["cells"])
-        notes |= dict.fromkeys(result.metrics["notes"])
-        for failure in result.metrics["failed"]:
-            reasons.setdefault(failure["error"], []).append(failure["combination"])
+    for count, metrics in stored_metrics(store, jobs):
+        runs += count
+        notes |= dict.fromkeys(metrics.notes)
+        for failure in metrics.failed:
+            reasons.setdefault(failure.error, []).append(failure.combination)
     print_notes(notes)
     lines = [
         one_line(f"{' '.join(first_lines(combinations, 1, ''))}: {error}")
@@ -272,7 +280,7 @@ def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -
     from sdc_taichi.viz.plotting import save_picture
 
     field = chosen_grid(sweep).field
-    rows = store.rows([*group_columns(sweep), "month", field, metric])
+    rows = store.rows([*group_columns(sweep), "month", field, metric], [field, metric])
     table = best_by_month(rows, sweep, metric)
     if not len(table):
         print_notes(["no value has a run in each month, so none is best"])
