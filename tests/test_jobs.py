@@ -281,8 +281,8 @@ def test_names_of_files_stay_in_the_folder(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("format", "sdc-result/0", "format: Input should be 'sdc-result/1'"),
-        ("core_s", True, "core_s: Input should be a valid number"),
+        ("format", "sdc-result/0", "format: should be 'sdc-result/1'"),
+        ("core_s", True, "core_s: should be a valid number"),
         ("files_sha256", {"../../study.json": "0"}, "valid is a path below the folder"),
     ],
 )

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import copy
 from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from sdc_taichi import ConfigError, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, EnvOptions, SdcError, load_config
+from sdc_taichi.benchmark.suite import Suite, load_suite
 from sdc_taichi.cli.app import app
+from sdc_taichi.config import validated
+from sdc_taichi.config.sustaindc import _File as SustainDC
+from sdc_taichi.learning.algorithms import LEARNING_SETTINGS
+from sdc_taichi.learning.training_settings import TrainingSettings
 from test_config import HALL, HVAC, SERVERS, dc_config, sustaindc_values
 
 
@@ -278,3 +285,124 @@ def test_commands() -> None:
 def test_errors_fit_on_a_line_of_any_width() -> None:
     done = CliRunner().invoke(app, ["config", "check", "hall.x=1"], env={"COLUMNS": "40"})
     assert re.fullmatch(r"error: preset corrected: hall\.x: unknown key.*\n", done.stderr)
+
+
+# Every field of every kind of settings
+
+TYPED_RACKS = load_config(
+    "corrected",
+    [
+        "hall.rack_types={gpu: {servers: [{count: 4, full_w: 900, idle_w: 90, fan_w: 15}]}}",
+        "hall.rack_plan=[{type: gpu, rows: 0-3, racks: 0-4}]",
+        "events.sampled=[{kind: heat_wave, offset_k: 5, per_year: 2, duration_h: [1, 3]}]",
+        "tariff.periods=[{from_h: 8, to_h: 20, price_per_kwh: 0.2}]",
+        "hvac.crac.unit_shares=" + str([[1.0]] * 20),
+    ],
+)
+WRONG: tuple[Any, ...] = (
+    *("x", "", -1e9, None, True),
+    *([], [[1]], [[["x"]]], [1, 2, 3, "x"]),
+    *({}, {"a": {}}, {5: 1}),
+)
+PYDANTIC_WORDS = re.compile(
+    r"Input|[A-Z][a-z]+ should|instance of|constrained|function-|\w\[|unable to|Value error|Extra"
+)
+
+
+def unset(model: type[BaseModel], **values: Any) -> dict[str, Any]:
+    """None for every field of a model, except for some values."""
+    return {**dict.fromkeys(model.model_fields), **values}
+
+
+SETTINGS: list[tuple[type[BaseModel], dict[str, Any]]] = [
+    (DataCenterConfig, load_config("tiny").model_dump(mode="json")),
+    (DataCenterConfig, TYPED_RACKS.model_dump(mode="json")),
+    (SustainDC, sustaindc_values()),
+    (EnvOptions, unset(EnvOptions)),
+    (Suite, load_suite("carbon").model_dump(mode="json")),
+    (TrainingSettings, unset(TrainingSettings, algorithm="happo")),
+    *((model, unset(model)) for model in dict.fromkeys(LEARNING_SETTINGS.values())),
+]
+
+
+def places(values: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Path of every value, with the first entry of each list."""
+    yield path
+    inside = values.items() if isinstance(values, dict) else enumerate(values[:1] or [])
+    for key, value in inside:
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+        else:
+            yield (*path, key)
+
+
+def with_value(values: Any, path: tuple[Any, ...], value: Any) -> Any:
+    if not path:
+        return value
+    changed = copy(values)
+    changed[path[0]] = with_value(changed[path[0]], path[1:], value)
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("model", "values"), SETTINGS, ids=lambda each: getattr(each, "__name__", "")
+)
+def test_errors_of_every_field_are_in_words_of_the_file(
+    model: type[BaseModel], values: dict[str, Any]
+) -> None:
+    told = 0
+    for path in places(values):
+        for wrong in WRONG:
+            try:
+                validated(model, with_value(values, path, wrong), "file")
+            except SdcError as error:
+                line = re.sub(r"\(got .*?\)|'.*?'", "", str(error))
+                assert PYDANTIC_WORDS.search(line) is None, (path, wrong, line)
+                assert "\n" not in line
+                told += 1
+    assert told > 5
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        (
+            "hvac.crac.airflow_m3s=[a]",
+            "hvac.crac.airflow_m3s.0: should be a valid number (got 'a')",
+        ),
+        (
+            "hvac.crac.airflow_m3s=x",
+            "hvac.crac.airflow_m3s: should be a valid number or a list (got 'x')",
+        ),
+        ("hvac.crac.airflow_m3s=-1", "hvac.crac.airflow_m3s: should be greater than or equal to"),
+        ("hall.rack_types={int: {servers: []}}", "hall.rack_types.int.servers: should be a list"),
+        (
+            "hall.rack_types={int: {servers: [{count: 1, full_w: 500}]}}",
+            "preset tiny: hall.rack_types.int.servers.0.idle_w: missing",
+        ),
+        ("hall.layout=5", "hall.layout: should be a mapping of fields (got 5)"),
+        ("battery.capacity_kwh=[5]", "battery.capacity_kwh: should be a valid number (got [5])"),
+        ("servers.power_w=[0.25, 0.1]", "(got 0.25); power is in W, not kW"),
+        ("servers.groups.0.0.full_w=0.5", "(got 0.5); power is in W, not kW"),
+        ("workload.workload_file=x.csv", "unknown key; did you mean 'site.workload_file'?"),
+        ("site.trace=google_1", "unknown key; did you mean 'workload.trace'?"),
+    ],
+)
+def test_errors_say_what_the_field_takes(override: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config("tiny", [override])
+    assert said in str(caught.value)
+    assert ";" not in str(caught.value).replace(said, "")
+    assert said.endswith("not kW") or "W, not kW" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "field"),
+    [
+        ("workload.trace=/data/file.csv", "site.workload_file"),
+        ("workload.trace=file.csv", "site.workload_file"),
+        ("site.location=./NY.epw", "site.weather_file"),
+    ],
+)
+def test_files_in_place_of_names_are_told_their_field(override: str, field: str) -> None:
+    fails(["simulate", "tiny", "--days", "1", override], [override.partition("=")[2], field])

@@ -71,9 +71,10 @@ def test_difference_names_the_setting_and_both_values() -> None:
     ("values", "said"),
     [
         ({"algorithm": "hapo"}, "algorithm: no algorithm; did you mean 'happo'"),
+        ({"scenario": ["carbon"]}, "scenario: should be a text"),
         ({"algoritm": "happo"}, "algoritm: unknown key; did you mean 'algorithm'"),
         ({"learning": {"epoch": 1}}, "settings of happo: epoch: unknown key; did you mean 'epochs"),
-        ({"learning": {"discount": 2}}, "discount: Input should be less than or equal to 1"),
+        ({"learning": {"discount": 2}}, "discount: should be less than or equal to 1"),
         ({"steps": 1.5}, "steps: .* valid integer"),
         ({"sites": ["NY", "ny"]}, r"sites: .* valid is each site once"),
         ({"weeks": [52]}, "weeks.*less than 52"),

@@ -439,12 +439,14 @@ def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
     Raises:
         ConfigError: the file cannot be read, or has a different format.
     """
-    text = read_text(path, MOST_METRICS_BYTES, ConfigError)
+    text, values = read_text(path, MOST_METRICS_BYTES, ConfigError), None
     try:
         record = model.model_validate_json(text)
         load_json(text)  # refuses numbers that are not finite, and keys that exist twice
     except ValidationError as error:
-        raise ConfigError(explain(error, str(path), model)) from None
+        with contextlib.suppress(ValueError):
+            values = load_json(text)
+        raise ConfigError(explain(error, str(path), model, values)) from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
     return record

@@ -7,7 +7,9 @@ unit. The docstrings of the types below, or of the field, explain the bounds.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import (
@@ -19,9 +21,9 @@ from pydantic import (
     ValidationInfo,
     field_validator,
 )
-from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+from pydantic_core import CoreSchema, ErrorDetails, PydanticKnownError, core_schema
 
-from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, shortened, similar_names, suggestion_or_valid
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C
 from sdc_taichi.plant.plants import PLANTS
 
@@ -170,6 +172,46 @@ MOST_PROBLEMS = 3
 """Largest number of problems that an error message lists; further problems are only counted."""
 
 
+_MESSAGES = {
+    "missing": "missing",
+    "greater_than": "should be greater than {gt}",
+    "greater_than_equal": "should be greater than or equal to {ge}",
+    "less_than": "should be less than {lt}",
+    "less_than_equal": "should be less than or equal to {le}",
+    "finite_number": "should be a finite number",
+    "float_type": "should be a valid number",
+    "float_parsing": "should be a valid number",
+    "int_type": "should be a valid integer",
+    "int_parsing": "should be a valid integer",
+    "int_from_float": "should be a valid integer",
+    "int_parsing_size": "should be a valid integer of at most 19 digits",
+    "bool_type": "should be true or false",
+    "bool_parsing": "should be true or false",
+    "string_type": "should be a text",
+    "string_too_short": "should have at least {min_length} character(s)",
+    "string_too_long": "should have at most {max_length} characters",
+    "string_pattern_mismatch": "should match the pattern {pattern}",
+    "tuple_type": "should be a list",
+    "list_type": "should be a list",
+    "dict_type": "should be a mapping",
+    "mapping_type": "should be a mapping",
+    "model_type": "should be a mapping of fields",
+    "model_attributes_type": "should be a mapping of fields",
+    "too_short": "should be a list of at least {min_length} item(s), not {actual_length}",
+    "too_long": "should be a list of at most {max_length} item(s)",
+    "literal_error": "should be {expected}",
+    "none_required": "should be null",
+    "invalid_key": "key should be a text",
+    "value_error": "{error}",
+    "assertion_error": "{error}",
+}
+"""Messages by pydantic's type of error, formatted with the context of the error. Pydantic's own
+messages name its classes, and not what a file may contain."""
+_WRONG_KIND = ("_type", "_parsing", "none_required", "literal_error", "int_from_float", "too_short")
+"""Ends of the types of errors that say that a value is of another kind than its field. Pydantic
+does not count invalid entries, so a list with an invalid entry may be too short as well."""
+
+
 def validated(model: type[Model], values: Any, label: str) -> Model:
     """Validate plain values and return them as an object of a pydantic model.
 
@@ -184,48 +226,123 @@ def validated(model: type[Model], values: Any, label: str) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(explain(error, label, model)) from None
+        raise ConfigError(explain(error, label, model, values)) from None
 
 
-def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
+@dataclass(frozen=True)
+class _Problem:
+    """Invalid value of a key."""
+
+    where: str
+    """Dotted path of the key."""
+    text: str
+    """What would be valid."""
+    got: str
+    """The value in brackets, and a hint; empty if the value is missing or a section."""
+    is_wrong_kind: bool
+    """True if the value is of another kind than the field, such as a text for a number."""
+
+
+def explain(error: ValidationError, label: str, model: type[BaseModel], values: Any) -> str:
     """Return a line of text that names each invalid key, its value and the valid values.
 
     Args:
         error: Validation error of pydantic.
         label: Source of the values, with which the text begins.
         model: Class of the pydantic model.
+        values: Plain values that were validated.
     """
-    problems: dict[str, str] = {}
+    at_key: dict[str, list[_Problem]] = {}
     # List unknown keys first, because they may be misspellings of missing keys.
     items = error.errors(include_url=False)
     for item in sorted(items, key=lambda item: item["type"] != "extra_forbidden"):
-        *sections, last = item["loc"] or ("",)
-        parts = [part for part in sections if not _is_union_branch(part)]
-        # For these errors the last part is always a user's key, even if it looks like a branch.
-        if item["type"] in ("extra_forbidden", "invalid_key") or not _is_union_branch(last):
-            parts.append(last)
-        where = ".".join(map(str, parts))
-        if item["type"] == "extra_forbidden":
-            valid = _keys_of(model, parts[:-1])
-            text = f"{where}: unknown key{suggestion_or_valid(last, valid)}"
-        elif item["type"] == "missing":
-            text = f"{where}: missing"
-        else:
-            message = item["msg"].removeprefix("Value error, ")
-            text = f"{where}: {message}" if where else message
-            value = item["input"]
-            if value is None or isinstance(value, str | int | float | bool):
-                text += f" (got {shortened(value)})"
-        # Keep only the first problem at each key, because each branch of a union reports one.
-        problems.setdefault(where, text)
-    left_out = len(problems) - MOST_PROBLEMS
+        problem = _problem(item, model, values)
+        at_key.setdefault(problem.where, []).append(problem)
+    lines = []
+    for where, problems in at_key.items():
+        # Each branch of a union reports its own problem. A branch that takes values of this kind
+        # says what is wrong; the other branches do not matter.
+        inside = any(other.startswith(f"{where}.") for other in at_key)
+        matching = [problem for problem in problems if not problem.is_wrong_kind]
+        if inside and not matching:
+            continue
+        texts = dict.fromkeys(problem.text for problem in matching[:1] or problems)
+        first, *others = texts
+        text = " or ".join([first, *(other.removeprefix("should be ") for other in others)])
+        lines.append((f"{where}: {text}" if where else text) + problems[0].got)
+    left_out = len(lines) - MOST_PROBLEMS
     more = f" (and {left_out} more)" if left_out > 0 else ""
-    return f"{label}: {'; '.join([*problems.values()][:MOST_PROBLEMS])}{more}"
+    return f"{label}: {'; '.join(lines[:MOST_PROBLEMS])}{more}"
 
 
-def _is_union_branch(part: str | int) -> bool:
-    """Return True if a part of pydantic's location is a branch of a union, not a user's key."""
-    return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
+def _problem(item: ErrorDetails, model: type[BaseModel], values: Any) -> _Problem:
+    """Return the problem that an item of a validation error describes."""
+    kind, value = item["type"], item["input"]
+    parts = _keys_in(values, item["loc"], is_missing=kind in ("missing", "extra_forbidden"))
+    where = ".".join(map(str, parts))
+    if kind == "extra_forbidden":
+        text = f"unknown key{_known_key(model, parts)}"
+        return _Problem(where, text, "", is_wrong_kind=False)
+    template = _MESSAGES.get(kind)
+    context = item.get("ctx", {})
+    shown = {k: f"{v:.15g}" if isinstance(v, float) else v for k, v in context.items()}
+    text = item["msg"] if template is None else template.format(**shown)
+    count = re.search(r"\d+(?= \w+\(s\))", text)
+    text = text.replace("(s)", "" if count is not None and count[0] == "1" else "s")
+    is_wrong_kind = kind.endswith(_WRONG_KIND)
+    is_shown = value is None or isinstance(value, str | int | float | bool)
+    is_shown |= is_wrong_kind and isinstance(value, list | tuple | dict)
+    got = f" (got {shortened(value)})" if is_shown and kind != "missing" else ""
+    if kind.startswith("greater_than") and _is_in_w(parts) and float(value) > 0:
+        got += "; power is in W, not kW"
+    return _Problem(where, text, got, is_wrong_kind=is_wrong_kind)
+
+
+def _keys_in(values: Any, location: Sequence[str | int], *, is_missing: bool) -> list[str | int]:
+    """Return a location of pydantic without the names of branches of unions.
+
+    Args:
+        values: Plain values that were validated.
+        location: Location of an error in the values.
+        is_missing: True if the last part is a key even if the values do not have it.
+    """
+    keys: list[str | int] = []
+    for i, part in enumerate(location):
+        if isinstance(values, BaseModel):
+            values = dict(values)
+        is_key, inside = False, None
+        if isinstance(values, Mapping):
+            is_key, inside = part in values, values.get(part)
+        elif isinstance(values, list | tuple) and isinstance(part, int):
+            is_key, inside = True, values[part] if part < len(values) else None
+        if is_key or (is_missing and i == len(location) - 1):
+            keys.append(part)
+            values = inside
+    return keys
+
+
+def _is_in_w(parts: Sequence[str | int]) -> bool:
+    """Return True if a path is that of a power in W, by the name of its field."""
+    names = [part for part in parts if isinstance(part, str)]
+    return bool(names) and names[-1].endswith("_w") and not names[-1].endswith("_per_w")
+
+
+def _known_key(model: type[BaseModel], parts: Sequence[str | int]) -> str:
+    """Return the end of a message about an unknown key: the key that was probably meant.
+
+    It is a similar key of the same section, the same key of another section, or any key of the
+    section.
+    """
+    *sections, last = parts
+    valid = _keys_of(model, sections)
+    elsewhere = [
+        f"{name}.{last}"
+        for name, field in model.model_fields.items()
+        if (section := _section_in(field.annotation)) is not None and last in section.model_fields
+    ]
+    if elsewhere and not similar_names(last, valid):
+        return f"; did you mean {elsewhere[0]!r}?"
+    return suggestion_or_valid(last, valid)
 
 
 def _keys_of(model: type[BaseModel], path: Sequence[str | int]) -> list[str]:

@@ -32,6 +32,11 @@ from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.user_file import list_folder
 
 _STATE_OF_CARBON_FILE = re.compile(r"([A-Z]{2})_NG_")
+_FILE_FIELDS = {
+    "site": "site.weather_file and site.carbon_file (--weather, --carbon)",
+    "trace": "site.workload_file (--workload)",
+}
+"""Fields and options for files in place of names, by what the name would be of."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
@@ -86,7 +91,11 @@ def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
     if valid_name is None:
         near = similar_names(name, valid, most=3)
         nearest = f"; nearest: {', '.join(near)}" if near else ""
-        raise DataError(f"{kind} {shortened(name)}: expected one of {', '.join(valid)}{nearest}")
+        is_file = re.search(r"[/\\]|\.[a-z]\w+$", name.lower()) and kind in _FILE_FIELDS
+        file = f"; a file is the value of {_FILE_FIELDS[kind]}" if is_file else ""
+        raise DataError(
+            f"{kind} {shortened(name)}: expected one of {', '.join(valid)}{nearest}{file}"
+        )
     return valid_name
 
 

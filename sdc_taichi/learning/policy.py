@@ -369,7 +369,7 @@ class Policy:
         try:
             read = _Description.model_validate_json(text)
         except ValidationError as error:
-            raise SdcError(explain(error, str(path), _Description)) from None
+            raise SdcError(explain(error, str(path), _Description, described)) from None
         try:
             networks = tuple(_network(i, one, tensors) for i, one in enumerate(read.networks))
             if tensors:

@@ -232,7 +232,8 @@ class TrainingSettings(Section):
         if not isinstance(values, Mapping):
             return values
         name = values.get("scenario")
-        if name is not None:
+        # The field itself refuses a name that is no text.
+        if isinstance(name, str):
             if name not in SCENARIOS:
                 raise ValueError(f"scenario {name!r}{suggestion_or_valid(name, SCENARIOS)}")
             values = merged(SCENARIOS[name], values)
