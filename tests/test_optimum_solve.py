@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from sdc_taichi.optimum.problem import AGENTS, Ends
 from sdc_taichi.optimum.tables import FacilityTable, facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
+from sdc_taichi.sim import snapshot
 
 DAY = 96
 
@@ -255,6 +258,99 @@ def test_files_that_are_damaged_or_swapped_are_solved_anew(tmp_path: Path) -> No
         damaged = solved(configs, steps=24, cache=tmp_path)
     np.testing.assert_array_equal(damaged.achieved, first.achieved)
     assert solved(configs, steps=24, cache=tmp_path).names == ("CA", "NY")
+
+
+def edited_text(arrays: dict[str, Any], **values: Any) -> dict[str, Any]:
+    return {"text": np.array(json.dumps(json.loads(str(arrays["text"])) | values))}
+
+
+def certified(arrays: dict[str, Any], **values: Any) -> dict[str, Any]:
+    text = json.loads(str(arrays["text"]))
+    return edited_text(arrays, certificate=text["certificate"] | values)
+
+
+FORGERIES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "achieved below 0": lambda _: {"achieved": np.array(-1e9)},
+    "achieved better than the bound": lambda x: {
+        "achieved": 0.9 * x["bound"],
+        **certified(x, figure=float(0.9 * x["bound"])),
+    },
+    "an estimate better than the bound": lambda x: {
+        "achieved": 0.5 * x["bound"],
+        **edited_text(x, kind="estimate: rough"),
+    },
+    "achieved of another certificate": lambda x: {"achieved": 1.01 * x["achieved"]},
+    "achieved nan": lambda _: {"achieved": np.array(np.nan)},
+    "achieved text": lambda _: {"achieved": np.array("1")},
+    "achieved list": lambda x: {"achieved": np.full(3, x["achieved"])},
+    "achieved whole": lambda _: {"achieved": np.array(3)},
+    "idle infinite": lambda _: {"idle": np.array(np.inf)},
+    "no bound": lambda _: {"bound": np.array(np.nan)},
+    "load nan": lambda x: {"load": x["load"] * np.nan},
+    "load of 2": lambda x: {"load": x["load"] + 2.0},
+    "battery of texts": lambda x: {"battery": np.array(["x"] * len(x["battery"]))},
+    "other shape": lambda x: {"cooling": x["cooling"][None]},
+    "text of a number": lambda _: {"text": np.array(3.0)},
+    "text of a list": lambda _: {"text": np.array("[1]")},
+    "deep text": lambda _: {"text": np.array("[" * 100_000)},
+    "alone null": lambda x: edited_text(x, alone=None),
+    "alone empty": lambda x: edited_text(x, alone={}),
+    "alone text": lambda x: edited_text(x, alone=dict.fromkeys(AGENTS, "x")),
+    "kind number": lambda x: edited_text(x, kind=1),
+    "kind other": lambda x: edited_text(x, kind="proof"),
+    "failures null": lambda x: edited_text(x, failures=None),
+    "failures numbers": lambda x: edited_text(x, failures=[1]),
+    "certificate empty": lambda x: edited_text(x, certificate={}),
+    "certificate list": lambda x: edited_text(x, certificate=[1.0]),
+    "limit of inlets null": lambda x: certified(x, inlet_limit_c=None),
+    "end nan": lambda x: certified(x, end_kwh=float("nan")),
+    "more": lambda x: edited_text(x, more=1),
+}
+
+
+@pytest.fixture(scope="module")
+def cached(tmp_path_factory: pytest.TempPathFactory) -> tuple[Optimum, Path]:
+    """An optimum, and the folder that keeps it."""
+    folder = tmp_path_factory.mktemp("kept")
+    return solved(config_of("CA"), steps=24, cache=folder), folder
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_optimum_is_solved_anew(
+    cached: tuple[Optimum, Path], tmp_path: Path, name: str
+) -> None:
+    first, folder = cached
+    (kept,) = folder.iterdir()
+    forged, arrays = tmp_path / kept.name, snapshot.read(kept)
+    snapshot.write(forged, arrays | FORGERIES[name](arrays))
+    with pytest.warns(OptimumCacheWarning, match=r"npz: .*; the optimum is solved anew") as told:
+        again = solved(config_of("CA"), steps=24, cache=tmp_path)
+    assert "\n" not in str(told[0].message)
+    assert again.achieved.tolist() == first.achieved.tolist()
+    assert again.bound.tolist() == first.bound.tolist()
+    assert forged.read_bytes() == kept.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        {"figures": np.array([-1e9])},
+        {"figures": np.array([np.nan])},
+        {"figures": np.array("x")},
+        {"figures": np.array(1.0)},
+        {"ends": np.array([[1.0, 2.0]])},
+        {"ends": np.array([["a", "b", "c", "d"]])},
+        {"ends": np.array(1.0)},
+    ],
+)
+def test_forged_bounds_of_ends_are_solved_anew(tmp_path: Path, edit: dict[str, Any]) -> None:
+    ends = Ends(2.0, 0.0, 1.0, 5.0)
+    first = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends(0, ends)
+    (kept,) = tmp_path.glob("*-ends.npz")
+    snapshot.write(kept, snapshot.read(kept) | edit)
+    with pytest.warns(OptimumCacheWarning, match="bounds of ends are solved anew"):
+        again = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends(0, ends)
+    assert again == first
 
 
 def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path: Path) -> None:

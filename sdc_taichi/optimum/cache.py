@@ -4,25 +4,50 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sdc_taichi.atomic_file import ClaimedFileError
-from sdc_taichi.errors import SdcError, SdcWarning, printable
-from sdc_taichi.optimum.problem import Ends
+from sdc_taichi.errors import SdcError, SdcWarning, one_line, printable, shortened
+from sdc_taichi.optimum.problem import Agent, Ends
+from sdc_taichi.optimum.rollout import LARGEST_TABLE_ERROR, Certificate
 from sdc_taichi.sim import snapshot
 from sdc_taichi.types import F64
 
 _X = TypeVar("_X")
 METHOD = 1
 """Version of the solution method. Cached files of other versions are not used."""
-_TEXT = ("fingerprint", "alone", "kind", "failures", "certificate")
+_MOST_FIGURE = 1e15
+"""Largest figure of a cached optimum."""
+_ROUND_OFF = 1e-9
+"""Relative error of a comparison of two figures."""
+_Figure = Annotated[float, Field(ge=0.0, le=_MOST_FIGURE)]
+
+
+class _EntryText(BaseModel):
+    """Texts and numbers by name of an entry, which its file contains as JSON."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    fingerprint: str
+    """Key of the entry."""
+    alone: dict[str, _Figure]
+    """``Entry.alone``."""
+    kind: Annotated[str, Field(pattern="^(bound$|estimate: |none: )")]
+    """``Entry.kind``."""
+    failures: tuple[str, ...]
+    """``Entry.failures``."""
+    certificate: dict[str, float]
+    """``Entry.certificate``."""
 
 
 class OptimumCacheWarning(SdcWarning):
@@ -85,15 +110,18 @@ class Cache:
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = usual_folder() if folder is None else folder.absolute()
 
-    def find(self, key: str, steps: int) -> Entry | None:
+    def find(self, key: str, steps: int, agents: Sequence[Agent]) -> Entry | None:
         """Return the entry of a key, or None if there is no usable entry.
 
         Args:
             key: Key from ``key_of``.
             steps: Number of steps, T.
+            agents: Agents that the plans control.
         """
         return self._read(
-            self._path(key), lambda arrays: _from_arrays(arrays, key, steps), "the optimum is"
+            self._path(key),
+            lambda arrays: _from_arrays(arrays, key, steps, agents),
+            "the optimum is",
         )
 
     def keep(self, key: str, entry: Entry) -> None:
@@ -110,8 +138,13 @@ class Cache:
         def figures(arrays: Mapping[str, Any]) -> dict[Ends, float]:
             if str(arrays["fingerprint"]) != key:
                 raise ValueError("is of other configs, inputs or options")
-            pairs = zip(arrays["ends"].tolist(), arrays["figures"].tolist(), strict=True)
-            return {Ends(*map(float, ends)): float(figure) for ends, figure in pairs}
+            count = len(np.atleast_1d(arrays["figures"]))
+            ends = _numbers(arrays, "ends", (count, len(fields(Ends))), 0.0, _MOST_FIGURE)
+            bounds = _numbers(arrays, "figures", (count,), 0.0, _MOST_FIGURE)
+            return {
+                Ends(*each): figure
+                for each, figure in zip(ends.tolist(), bounds.tolist(), strict=True)
+            }
 
         return self._read(self._path(f"{key}-ends"), figures, "bounds of ends are") or {}
 
@@ -133,7 +166,7 @@ class Cache:
         try:
             return parse(snapshot.read(path))
         except (SdcError, ValueError, TypeError, KeyError) as error:
-            _warn(f"{printable(path)}: {error}; {what} solved anew")
+            _warn(f"{printable(path)}: {one_line(str(error))}; {what} solved anew")
             return None
 
     def _write(self, path: Path, values: Mapping[str, Any]) -> None:
@@ -161,27 +194,90 @@ def usual_folder() -> Path:
 def _to_arrays(entry: Entry, key: str) -> dict[str, Any]:
     """Convert an entry to arrays by name; text and dictionaries become one JSON string."""
     values = {f.name: getattr(entry, f.name) for f in fields(Entry)} | {"fingerprint": key}
-    text = json.dumps({name: values.pop(name) for name in _TEXT}, default=dict)
+    text = json.dumps({name: values.pop(name) for name in _EntryText.model_fields}, default=dict)
     return {**values, "text": text}
 
 
-def _from_arrays(arrays: Mapping[str, Any], key: str, steps: int) -> Entry:
+def _from_arrays(arrays: Mapping[str, Any], key: str, steps: int, agents: Sequence[Agent]) -> Entry:
     """Convert the arrays of a file to an entry.
 
     Raises:
-        ValueError, TypeError, KeyError: The arrays are no entry, or belong to another key.
+        ValueError, KeyError: The arrays are no entry, belong to another key, or contradict each
+            other.
     """
-    values: dict[str, Any] = json.loads(str(arrays["text"]))
-    if values.pop("fingerprint") != key:
+    try:
+        text = _EntryText.model_validate_json(str(arrays["text"]))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{where}: {first['msg']}") from None
+    if text.fingerprint != key:
         raise ValueError("is of other configs, inputs or options")
-    values["failures"] = tuple(values["failures"])
-    for name in ("load", "cooling", "battery"):
-        values[name] = arrays[name]
-        if values[name].shape != (steps,):
-            raise ValueError(f"has no {name} commands of {steps} steps")
-    for name in ("idle", "idle_dropped_tasks", "bound", "achieved"):
-        values[name] = float(arrays[name])
-    return Entry(**values)
+    if set(text.alone) != set(agents):
+        raise ValueError(f"alone is of {shortened(sorted(text.alone))}, not of {', '.join(agents)}")
+    values: dict[str, Any] = {
+        name: _numbers(arrays, name, (), 0.0, _MOST_FIGURE).item()
+        for name in ("idle", "idle_dropped_tasks", "achieved")
+    }
+    for name, most in (("load", 1.0), ("cooling", _MOST_FIGURE), ("battery", 1.0)):
+        values[name] = _numbers(arrays, name, (steps,), -most, most)
+    entry = Entry(
+        **values,
+        bound=_numbers(arrays, "bound", (), -_MOST_FIGURE, _MOST_FIGURE, or_nan=True).item(),
+        **text.model_dump(exclude={"fingerprint"}),
+    )
+    _check_figures(entry)
+    return entry
+
+
+def _check_figures(entry: Entry) -> None:
+    """Check that figures, kind of bound and certificate of an entry fit together.
+
+    Raises:
+        ValueError: They contradict each other.
+    """
+    values = entry.certificate
+    names = {f.name for f in fields(Certificate)} | {"inlet_limit_c"}
+    if set(values) != names:
+        raise ValueError(f"certificate has {shortened(sorted(values))}, not {', '.join(names)}")
+    for name, value in values.items():
+        if not math.isfinite(value) and not (name == "inlet_limit_c" and value == math.inf):
+            raise ValueError(f"{name} is {value}, not a finite number")
+    error = values["table_error"]
+    kind = entry.kind.partition(":")[0]
+    if kind != "none" and (kind == "bound") != (0.0 <= error <= LARGEST_TABLE_ERROR):
+        raise ValueError(f"kind {shortened(entry.kind)} is not that of a table error of {error:g}")
+    if (kind == "none") != math.isnan(entry.bound):
+        raise ValueError(f"bound {entry.bound:g} is of kind {shortened(entry.kind)}")
+    if entry.achieved != values["figure"]:
+        raise ValueError(f"achieved {entry.achieved:g}, certificate {values['figure']:g}")
+    if entry.achieved < entry.bound - (error + _ROUND_OFF) * abs(entry.bound):
+        raise ValueError(f"achieved {entry.achieved:g} is better than the bound {entry.bound:g}")
+
+
+def _numbers(
+    arrays: Mapping[str, Any],
+    name: str,
+    shape: tuple[int, ...],
+    low: float,
+    high: float,
+    *,
+    or_nan: bool = False,
+) -> npt.NDArray[np.float64]:
+    """Return an array of a file after checking its type, shape and range.
+
+    Raises:
+        ValueError, KeyError: The array is missing or not valid.
+    """
+    values = np.asarray(arrays[name])
+    if values.dtype != np.float64 or values.shape != shape:
+        raise ValueError(f"{name} is {values.dtype} {values.shape}, expected float64 {shape}")
+    valid = (values >= low) & (values <= high)
+    if or_nan:
+        valid |= np.isnan(values)
+    if not valid.all():
+        raise ValueError(f"{name} is not within {low:g}..{high:g}")
+    return values
 
 
 def _warn(message: str) -> None:

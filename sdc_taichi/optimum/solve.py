@@ -310,7 +310,7 @@ class _Work:
         keys = [""] * task.fleet.size if cache is None else task.keys()
         entries: dict[int, Entry] = {}
         if cache is not None:
-            known = {i: cache.find(key, task.steps) for i, key in enumerate(keys)}
+            known = {i: cache.find(key, task.steps, task.agents) for i, key in enumerate(keys)}
             entries = {i: entry for i, entry in known.items() if entry is not None}
         missing = [i for i in range(task.fleet.size) if i not in entries]
         self._all, self._kept, self._missing = len(keys), len(entries), len(missing)
