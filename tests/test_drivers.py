@@ -64,6 +64,15 @@ def test_design_conditions_of_a_file_size_the_plant(tmp_path: Path) -> None:
     assert without.design_wet_bulb_c == np.quantile(without.wet_bulb_c.values, 0.996)
 
 
+def test_design_temperatures_of_a_year_do_not_depend_on_the_time_step() -> None:
+    found = []
+    for steps in (1, 4, 60):
+        config = load_config("tiny", [f"simulation.steps_per_hour={steps}"])
+        drivers = load_drivers([config])
+        found.append((drivers.design_outdoor_c[0], drivers.design_wet_bulb_c[0]))
+    assert len(set(found)) == 1
+
+
 def test_series_of_different_length_repeat_on_their_own() -> None:
     drivers = drivers_from_arrays([1.0, 2.0, 3.0], [0.0] * 3, [100.0] * 3, [0.1, 0.2, 0.3])
     assert [float(drivers.at(k).outdoor_c[0]) for k in range(5)] == [1.0, 2.0, 3.0, 1.0, 2.0]

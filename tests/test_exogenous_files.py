@@ -21,6 +21,7 @@ from sdc_taichi.exogenous import (
 from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.exogenous.stamps import Stamp
+from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
 
 def write(path: Path, lines: list[str] | tuple[str, ...], newline: str = "\n") -> Path:
@@ -206,7 +207,10 @@ def test_epw_hour_one_is_the_first_interval(tmp_path: Path) -> None:
     assert weather.pressure_pa is not None
     expected = wet_bulb_c(weather.outdoor_c.values, 60.0, weather.pressure_pa.values)
     np.testing.assert_allclose(weather.wet_bulb_c.values, expected, rtol=0, atol=1e-12)
-    assert weather.outdoor_c.notes == ()
+    assert weather.outdoor_c.notes == (
+        "no design conditions: plants are sized for a dry bulb of 26.8 C and a wet bulb of 21.0 C, "
+        "which this year exceeds for 0.4 % of its hours",
+    )
 
 
 @pytest.mark.parametrize(
@@ -329,6 +333,63 @@ def test_design_conditions_are_those_of_the_header(tmp_path: Path) -> None:
         assert "design conditions of the header are not usable" in weather.outdoor_c.notes[0]
 
 
+@pytest.mark.parametrize("per_hour", [1, 4])
+def test_spikes_of_temperature_are_told(per_hour: int, tmp_path: Path) -> None:
+    lines = list(build.epw_lines(per_hour=per_hour))
+    lines[1] = build.DESIGN_LINE
+    assert read_epw(write(tmp_path / "x.epw", lines)).outdoor_c.notes == ()
+    around = [float(lines[at].split(",")[6]) for at in (99 - per_hour, 99 + per_hour)]
+    lines[99] = ",".join([*lines[99].split(",")[:6], "55.0", *lines[99].split(",")[7:]])
+    weather = read_epw(write(tmp_path / "x.epw", lines))
+    (note,) = weather.outdoor_c.notes
+    assert note.startswith("warning: 2 changes of the dry bulb by more than 15 K in an hour kept")
+    assert note.endswith(f", up to {55.0 - min(around):.1f} K (first: row 100)")
+    assert 55.0 in weather.outdoor_c.values
+
+
+def test_spikes_in_a_weather_table_are_told(tmp_path: Path) -> None:
+    rows = [
+        f"{day} {hour:02}:00,{10 + hour / 4},50"
+        for day in build.days("2021-01-01", "2022-01-01")
+        for hour in range(24)
+    ]
+    rows[30] = rows[30].replace(",11.5,", ",-14.0,")
+    place = Place("roof", 40.0, -75.0, 10.0, -5.0)
+    path = write(tmp_path / "roof.csv", ["timestamp,dry_bulb,relative_humidity", *rows])
+    weather = read_weather_table(path, place, columns={})
+    notes = "\n".join(weather.outdoor_c.notes)
+    assert "2 changes of the dry bulb by more than 15 K in an hour kept, up to 25.8 K" in notes
+    assert "(first: row 32)" in notes
+    assert "no design conditions: plants are sized for a dry bulb of 15." in notes
+
+
+@pytest.mark.parametrize("counted_mwh", [-316.0, 0.0])
+def test_an_hour_of_negative_generation_counts_as_none(counted_mwh: float, tmp_path: Path) -> None:
+    """Whatever the file counts it as in its average."""
+    lines, noon = build.carbon_lines(), 498
+    values = dict(zip(build.CARBON_HEADER.split(","), lines[noon].split(","), strict=True))
+    sun, nuclear = float(values["SUN"]), float(values["NUC"])
+
+    def intensity(gas: float) -> float:
+        carbon = 41.0 * sun + 12.0 * nuclear + 490.0 * gas
+        return carbon / (sun + nuclear + gas)
+
+    lines[noon] = ",".join(
+        (values | {"NG": "-316", "avg_CI": f"{intensity(counted_mwh):.4f}"}).values()
+    )
+    series = read_carbon(write(tmp_path / "ci.csv", lines), 0.0, "start")
+    note = "warning: 1 negative values of NG set to 0, the lowest is -316 MWh (first: row 499)"
+    assert note in series.notes
+    assert series.values[noon - 1] == pytest.approx(intensity(0.0), abs=1e-3)
+
+
+def test_a_row_of_negative_generation_alone_is_interpolated(tmp_path: Path) -> None:
+    lines = build.carbon_lines()
+    lines[500] = lines[500].split(",")[0] + ",0,0,0,0,-316,0,0,0,490"
+    series = read_carbon(write(tmp_path / "ci.csv", lines), 0.0, "start")
+    assert series.values[499] == pytest.approx(np.mean(series.values[[498, 500]]))
+
+
 def test_a_pressure_that_does_not_fit_the_elevation_is_told(tmp_path: Path) -> None:
     """Tucson's file: 101 kPa at 809 m from May to September."""
     lines = list(build.epw_lines())
@@ -338,6 +399,7 @@ def test_a_pressure_that_does_not_fit_the_elevation_is_told(tmp_path: Path) -> N
         cells = line.split(",")
         cells[9] = "101000" if cells[1] in summer else "92000"
         lines[at] = ",".join(cells)
+    lines[1] = build.DESIGN_LINE
     (note,) = read_epw(write(tmp_path / "tucson.epw", lines)).outdoor_c.notes
     assert note == (
         "warning: station pressure of 101.0 kPa in May, Jun, Jul, Aug, Sep does not fit the "

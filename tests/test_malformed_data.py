@@ -157,7 +157,7 @@ DAMAGES: dict[str, list[tuple[Damage, tuple[str, ...]]]] = {
         (lambda x: [r.replace(",2000,", ",,") for r in x], ("row 2", "NUC", "8760 h")),
         (cell(300, 5, "n.v."), ("row 300", "NG", "'n.v.'")),
         (cell(300, 5, "x" * 9000), ("row 300", "xx…, ex")),
-        (cell(301, 2, "-3"), ("row 301", "SUN", "'-3'")),
+        (cell(301, 2, "-2e6"), ("row 301", "SUN", "'-2e6'")),
         (cell(302, 9, "222.5"), ("row 302", "avg_CI", "222.5", "fuel mix")),
         (
             replace_row(303, "2022-01-13 13:00:00+00:00,0,0,0,0,0,0,0,0,300"),

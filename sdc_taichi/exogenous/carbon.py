@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple
@@ -25,6 +25,9 @@ MAX_CI_G_PER_KWH = 2000.0
 """Highest valid carbon intensity, in g/kWh."""
 MIX_TOLERANCE_G = 1.0
 """Largest valid difference of ``avg_CI`` from the intensity of the fuel mix, in g/kWh."""
+MOST_NEGATIVE_SHARE = 0.01
+"""Largest valid sum of negative generation, as a share of all generation. Single hours with
+negative values are errors of reports; plants that only consume at night have a lower share."""
 _MAX_GENERATION_MWH = 1e7
 
 
@@ -164,31 +167,62 @@ def _read_generation(path: Path, column_names: Mapping[str, str]) -> _Generation
 def _numbers(
     table: files.Table, columns: tuple[str, ...], named: ColumnMap
 ) -> tuple[FloatArray, list[str]]:
-    """Return generation and intensity, (T, columns), checked against each other, and notes."""
-    highest = dict.fromkeys(FUELS, _MAX_GENERATION_MWH) | {"avg_CI": MAX_CI_G_PER_KWH}
-    values = np.stack(
-        [
-            table.numbers(column, 0.0, highest[column], unit=named.unit(column))
-            for column in columns
-        ],
-        axis=1,
-    )
+    """Return generation and intensity, (T, columns), checked against each other, and notes.
+
+    Negative generation counts as 0, and in its rows the intensity is that of the fuel mix.
+    """
+    fuels = columns[:-1]
+    generation = [
+        table.numbers(name, -_MAX_GENERATION_MWH, _MAX_GENERATION_MWH, unit=named.unit(name))
+        for name in fuels
+    ]
+    generation, corrected, notes = _without_negative(table, fuels, generation)
+    text = table.frame["avg_CI"]
+    checked = files.Table(table.path, text.mask(corrected, "nan").to_frame())
+    intensity = checked.numbers("avg_CI", 0.0, MAX_CI_G_PER_KWH, unit=named.unit("avg_CI"))
     # A grid with only renewables has an intensity of 0 all year.
-    if not np.isnan(values[:, -1]).all() and 0.0 < np.nanmax(values[:, -1]) < 2.0:
+    if not np.isnan(intensity).all() and 0.0 < np.nanmax(intensity) < 2.0:
         raise DataError(
             f"{table.path}: row {table.frame.index[0]}, column avg_CI: at most "
-            f"{np.nanmax(values[:, -1]):g} in all rows, expected g/kWh (kg/kWh are read with "
+            f"{np.nanmax(intensity):g} in all rows, expected g/kWh (kg/kWh are read with "
             "--map avg_CI:kg/kWh=COLUMN)"
         )
-    if len(columns) == 1:
-        return values, ["no fuel mix to check avg_CI against"]
-    total = values[:, :-1].sum(axis=1)
-    table.refuse("WND..OTH", total == 0.0, "some generation", value=0.0)
-    mix = values[:, :-1] @ np.array([emission_factors()[fuel] for fuel in FUELS]) / total
-    off = np.abs(values[:, -1] - mix) > MIX_TOLERANCE_G
+    if not fuels:
+        return intensity[:, None], ["no fuel mix to check avg_CI against"]
+    mwh = np.stack(generation, axis=1)
+    total = mwh.sum(axis=1)
+    table.refuse("WND..OTH", (total == 0.0) & ~corrected, "some generation", value=0.0)
+    factors = np.array([emission_factors()[fuel] for fuel in fuels])
+    # Rows without any generation but a negative one are missing.
+    mix = mwh @ factors / np.where(total == 0.0, np.nan, total)
+    off = np.abs(intensity - mix) > MIX_TOLERANCE_G
     valid = f"{mix[np.argmax(off)]:.2f} +- {MIX_TOLERANCE_G:g} from the fuel mix"
     table.refuse("avg_CI", off, valid)
-    return values, []
+    intensity = np.where(corrected, mix, intensity)
+    return np.column_stack([mwh, intensity]), notes
+
+
+def _without_negative(
+    table: files.Table, fuels: Sequence[str], generation: Sequence[FloatArray]
+) -> tuple[list[FloatArray], NDArray[np.bool_], list[str]]:
+    """Set negative generation to 0; return it, True for each changed row, (T,), and notes."""
+    all_mwh = sum(float(np.nansum(np.abs(mwh))) for mwh in generation)
+    changed = np.zeros(len(table.frame), dtype=bool)
+    notes = []
+    for fuel, mwh in zip(fuels, generation, strict=True):
+        negative = mwh < 0.0
+        if not negative.any():
+            continue
+        if -mwh[negative].sum() > MOST_NEGATIVE_SHARE * all_mwh:
+            valid = f"0 or more (at most {MOST_NEGATIVE_SHARE:.0%} of all generation is negative)"
+            table.refuse(fuel, negative, valid)
+        first = int(table.frame.index[np.argmax(negative)])
+        notes.append(
+            f"warning: {int(negative.sum())} negative values of {fuel} set to 0, the lowest is "
+            f"{mwh[negative].min():g} MWh (first: row {first})"
+        )
+        changed |= negative
+    return [np.where(mwh < 0.0, 0.0, mwh) for mwh in generation], changed, notes
 
 
 def _repair(

@@ -31,6 +31,12 @@ plateau and 34.6 C at Dallol (Ethiopia)."""
 MOST_SPREAD_K = 115.0
 """Largest valid range of temperatures in a year, in K; the extreme is 105 K at Verkhoyansk."""
 
+DESIGN_QUANTILE = 0.996
+"""Quantile of the year that defines a design temperature: exceeded in 0.4 % of the year, as for
+ASHRAE design conditions."""
+_DESIGN_STEPS_PER_HOUR = 4
+"""Time step of the values of which design temperatures are quantiles, whatever step a run has."""
+
 
 @dataclass(frozen=True, eq=False)
 class Series:
@@ -174,6 +180,21 @@ class SiteData(Weather):
     def synthetic(self) -> bool:
         """True if dry bulb, wet bulb or carbon intensity was generated."""
         return any(s.synthetic for s in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh))
+
+
+def design_temperatures_c(weather: Weather) -> tuple[float, float]:
+    """Return the design dry bulb and wet bulb of a site, in C.
+
+    They are the design conditions of the station or, without these, the temperatures exceeded in
+    0.4 % of the year.
+    """
+    if weather.design is not None:
+        return weather.design.outdoor_c, weather.design.wet_bulb_c
+    outdoor_c, wet_bulb_c = (
+        float(np.quantile(resample(series, _DESIGN_STEPS_PER_HOUR), DESIGN_QUANTILE))
+        for series in (weather.outdoor_c, weather.wet_bulb_c)
+    )
+    return outdoor_c, wet_bulb_c
 
 
 def step_minutes(steps_per_hour: int) -> int:

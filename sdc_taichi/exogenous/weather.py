@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from sdc_taichi.exogenous.series import (
     FloatArray,
     Series,
     Weather,
+    design_temperatures_c,
 )
 from sdc_taichi.exogenous.year_clock import (
     DAYS_PER_MONTH,
@@ -70,6 +72,9 @@ _DEW_POINT_SLACK_K = 0.2
 MOST_PRESSURE_SHARE = 0.05
 """Largest valid difference of a month's mean pressure from the standard atmosphere, as a share of
 the latter. Weather and climate cause up to 0.03 at inhabited elevations."""
+MOST_RISE_K = 15.0
+"""Largest change of the dry bulb within an hour without a warning, in K. Weather seldom exceeds it;
+damaged records do."""
 _COOLING_CELLS = {"outdoor_c": 3, "wet_bulb_c": 9}
 """Cells of the design conditions, counted from the cell ``Cooling``."""
 _EXTREME_OUTDOOR_CELL = -3
@@ -116,6 +121,7 @@ def read_epw(path: str | Path) -> Weather:
     values, rows, absent_notes = table.spread(columns, positions)
     names = [column.name for column in _USED]
     values = files.fill_gaps(path, values, minutes, names, rows)
+    notes += spike_notes(values[:, 0], minutes, rows)
     values, year_notes = files.whole_years(path, values, float(hours[0]) * 60.0, minutes)
     air = Air(*values.T)
     notes += column_notes + absent_notes + year_notes
@@ -157,7 +163,7 @@ def make_weather(
     def series(name: str, unit: str, x: FloatArray) -> Series:
         return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(notes))
 
-    return Weather(
+    weather = Weather(
         **location,
         outdoor_c=series("outdoor_c", "C", air.outdoor_c),
         wet_bulb_c=series("wet_bulb_c", "C", wet_bulb_c(*air)),
@@ -165,6 +171,34 @@ def make_weather(
         pressure_pa=series("pressure_pa", "Pa", air.pressure_pa),
         design=design,
     )
+    if design is not None:
+        return weather
+    dry_bulb, wet_bulb = design_temperatures_c(weather)
+    note = (
+        f"no design conditions: plants are sized for a dry bulb of {dry_bulb:.1f} C and a wet bulb "
+        f"of {wet_bulb:.1f} C, which this year exceeds for 0.4 % of its hours"
+    )
+    outdoor = weather.outdoor_c
+    return replace(weather, outdoor_c=replace(outdoor, notes=(*outdoor.notes, note)))
+
+
+def spike_notes(outdoor_c: FloatArray, minutes: float, rows: NDArray[np.int64]) -> list[str]:
+    """Return a warning about changes of the dry bulb that are hardly weather.
+
+    Args:
+        outdoor_c: dry bulb, in C, in the order of the file, (T,).
+        minutes: resolution, in minutes.
+        rows: row of the file that each value came from, for the message, (T,).
+    """
+    lag = max(1, round(60.0 / minutes))
+    change_k = np.abs(outdoor_c[lag:] - outdoor_c[:-lag]) / max(1.0, minutes / 60.0)
+    steep = change_k > MOST_RISE_K
+    if not steep.any():
+        return []
+    return [
+        f"warning: {int(steep.sum())} changes of the dry bulb by more than {MOST_RISE_K:g} K in an "
+        f"hour kept, up to {change_k.max():.1f} K (first: row {int(rows[lag + np.argmax(steep)])})"
+    ]
 
 
 def read_city(path: str | Path) -> str:

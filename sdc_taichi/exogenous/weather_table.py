@@ -24,6 +24,7 @@ from sdc_taichi.exogenous.weather import (
     capped_humidity,
     check_dew_point,
     make_weather,
+    spike_notes,
 )
 
 _LIMITS = {
@@ -92,6 +93,7 @@ def read_weather_table(
     values, notes = _numbers(table, names, named)
     values, rows, absent_notes = table.spread(values, positions)
     values = files.fill_gaps(path, values, minutes, names, rows)
+    notes += spike_notes(values[:, 0], minutes, rows)
     values, year_notes = files.calendar_years(path, values, stamps[0], minutes)
     notes += absent_notes + year_notes
     outdoor, humidity = values[:, 0], values[:, 1]

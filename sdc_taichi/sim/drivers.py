@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,14 +20,18 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.carbon import MAX_CI_G_PER_KWH, Pairing
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
-from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, Series, SiteData, resample
+from sdc_taichi.exogenous.series import (
+    DESIGN_QUANTILE,
+    OUTDOOR_LIMITS_C,
+    Series,
+    SiteData,
+    design_temperatures_c,
+    resample,
+)
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.types import F64, I64, Exogenous
 
-DESIGN_QUANTILE = 0.996
-"""Quantile of the year that defines a design temperature: exceeded in 0.4 % of the year, as for
-ASHRAE design conditions."""
 MAX_KEPT_BYTES = 2**28
 """Maximum memory of the cache of input series, in bytes: about 900 synthetic years of a site and a
 trace."""
@@ -252,7 +256,7 @@ class InputReader:
         of_sites = {key: self._site_arrays(key, site) for key, site in sites.items()}
         of_traces = {key: resample(x, self._steps_per_hour) for key, x in series.items()}
         if self._design_c is None:
-            self._design_c = self._design_temperatures(of_sites)
+            self._design_c = self._design_temperatures()
         outdoor_c = fleet_series([of_sites[key].outdoor_c for key in site_keys])
         inputs = [(sites[s], series[t]) for s, t in zip(site_keys, trace_keys, strict=True)]
         return Drivers(
@@ -315,19 +319,9 @@ class InputReader:
             return self._trace(key).synthetic
         return _site_is_synthetic(self._site(key))
 
-    def _design_temperatures(self, of_sites: Mapping[_SiteKey, _SiteArrays]) -> tuple[F64, F64]:
+    def _design_temperatures(self) -> tuple[F64, F64]:
         """Return design dry bulb and wet bulb for the years of the configs, in C, (B,) each."""
-        design = {}
-        for key in dict.fromkeys(self._sites):
-            station = self._site(key).design
-            if station is not None:
-                design[key] = [station.outdoor_c, station.wet_bulb_c]
-                continue
-            arrays = of_sites.get(key) or self._site_arrays(key, self._site(key))
-            design[key] = [
-                float(np.quantile(values, DESIGN_QUANTILE))
-                for values in (arrays.outdoor_c, arrays.wet_bulb_c)
-            ]
+        design = {key: design_temperatures_c(self._site(key)) for key in dict.fromkeys(self._sites)}
         outdoor_c, wet_bulb_c = np.array([design[key] for key in self._sites]).T
         return outdoor_c.copy(), wet_bulb_c.copy()
 
