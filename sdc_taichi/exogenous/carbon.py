@@ -216,7 +216,7 @@ def _without_negative(
         if -mwh[negative].sum() > MOST_NEGATIVE_SHARE * all_mwh:
             valid = f"0 or more (at most {MOST_NEGATIVE_SHARE:.0%} of all generation is negative)"
             table.refuse(fuel, negative, valid)
-        first = int(table.frame.index[np.argmax(negative)])
+        first = int(table.frame.index[int(np.argmax(negative))])
         notes.append(
             f"warning: {int(negative.sum())} negative values of {fuel} set to 0, the lowest is "
             f"{mwh[negative].min():g} MWh (first: row {first})"

@@ -182,19 +182,12 @@ class SiteData(Weather):
         return any(s.synthetic for s in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh))
 
 
-def design_temperatures_c(weather: Weather) -> tuple[float, float]:
-    """Return the design dry bulb and wet bulb of a site, in C.
+def rarely_exceeded(series: Series) -> float:
+    """Return the value that a series exceeds in 0.4 % of its time, in the unit of the series.
 
-    They are the design conditions of the station or, without these, the temperatures exceeded in
-    0.4 % of the year.
+    For temperatures it is the design temperature of a site without design conditions.
     """
-    if weather.design is not None:
-        return weather.design.outdoor_c, weather.design.wet_bulb_c
-    outdoor_c, wet_bulb_c = (
-        float(np.quantile(resample(series, _DESIGN_STEPS_PER_HOUR), DESIGN_QUANTILE))
-        for series in (weather.outdoor_c, weather.wet_bulb_c)
-    )
-    return outdoor_c, wet_bulb_c
+    return float(np.quantile(resample(series, _DESIGN_STEPS_PER_HOUR), DESIGN_QUANTILE))
 
 
 def step_minutes(steps_per_hour: int) -> int:

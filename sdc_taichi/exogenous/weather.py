@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ from sdc_taichi.exogenous.series import (
     FloatArray,
     Series,
     Weather,
-    design_temperatures_c,
+    rarely_exceeded,
 )
 from sdc_taichi.exogenous.year_clock import (
     DAYS_PER_MONTH,
@@ -160,26 +159,26 @@ def make_weather(
         design: design conditions in the file; None if it has none.
     """
 
-    def series(name: str, unit: str, x: FloatArray) -> Series:
-        return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(notes))
+    wet_bulb, all_notes = wet_bulb_c(*air), list(notes)
 
-    weather = Weather(
+    def series(name: str, unit: str, x: FloatArray) -> Series:
+        return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(all_notes))
+
+    if design is None:
+        dry_c = rarely_exceeded(series("outdoor_c", "C", air.outdoor_c))
+        wet_c = rarely_exceeded(series("wet_bulb_c", "C", wet_bulb))
+        all_notes.append(
+            f"no design conditions: plants are sized for a dry bulb of {dry_c:.1f} C and a wet "
+            f"bulb of {wet_c:.1f} C, which this year exceeds for 0.4 % of its hours"
+        )
+    return Weather(
         **location,
         outdoor_c=series("outdoor_c", "C", air.outdoor_c),
-        wet_bulb_c=series("wet_bulb_c", "C", wet_bulb_c(*air)),
+        wet_bulb_c=series("wet_bulb_c", "C", wet_bulb),
         relative_humidity_pct=series("relative_humidity_pct", "%", air.relative_humidity_pct),
         pressure_pa=series("pressure_pa", "Pa", air.pressure_pa),
         design=design,
     )
-    if design is not None:
-        return weather
-    dry_bulb, wet_bulb = design_temperatures_c(weather)
-    note = (
-        f"no design conditions: plants are sized for a dry bulb of {dry_bulb:.1f} C and a wet bulb "
-        f"of {wet_bulb:.1f} C, which this year exceeds for 0.4 % of its hours"
-    )
-    outdoor = weather.outdoor_c
-    return replace(weather, outdoor_c=replace(outdoor, notes=(*outdoor.notes, note)))
 
 
 def spike_notes(outdoor_c: FloatArray, minutes: float, rows: NDArray[np.int64]) -> list[str]:

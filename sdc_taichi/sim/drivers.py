@@ -25,7 +25,7 @@ from sdc_taichi.exogenous.series import (
     OUTDOOR_LIMITS_C,
     Series,
     SiteData,
-    design_temperatures_c,
+    rarely_exceeded,
     resample,
 )
 from sdc_taichi.exogenous.workload import read_workload
@@ -321,7 +321,14 @@ class InputReader:
 
     def _design_temperatures(self) -> tuple[F64, F64]:
         """Return design dry bulb and wet bulb for the years of the configs, in C, (B,) each."""
-        design = {key: design_temperatures_c(self._site(key)) for key in dict.fromkeys(self._sites)}
+        design = {}
+        for key in dict.fromkeys(self._sites):
+            site = self._site(key)
+            design[key] = (
+                (rarely_exceeded(site.outdoor_c), rarely_exceeded(site.wet_bulb_c))
+                if site.design is None
+                else (site.design.outdoor_c, site.design.wet_bulb_c)
+            )
         outdoor_c, wet_bulb_c = np.array([design[key] for key in self._sites]).T
         return outdoor_c.copy(), wet_bulb_c.copy()
 
