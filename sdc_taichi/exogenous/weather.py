@@ -158,7 +158,6 @@ def make_weather(
         notes: repairs and warnings.
         design: design conditions in the file; None if it has none.
     """
-
     wet_bulb, all_notes = wet_bulb_c(*air), list(notes)
 
     def series(name: str, unit: str, x: FloatArray) -> Series:
