@@ -38,7 +38,7 @@ A matrix of 8,192 racks with 32 characters per number has this size.
 """
 MOST_METRICS_BYTES = 1_000_000_000
 """Largest size of metrics.json, in bytes: 10 kB for each of 100,000 data centers."""
-_HEADER_BYTES = 1 << 16
+_HEADER_BYTES = _CHUNK_BYTES = 1 << 16
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
@@ -144,7 +144,10 @@ def read_bytes(
             size said, because it is growing. The error is of class ``error``.
     """
     with open_input(path, most_bytes, error) as file:
-        content = file.read(most_bytes + 1)
+        # A read takes memory for as many bytes as it is asked for.
+        content = file.read(min(os.fstat(file.fileno()).st_size, most_bytes) + 1)
+        while len(content) <= most_bytes and (more := file.read(_CHUNK_BYTES)):
+            content += more
     if len(content) > most_bytes:
         raise error(f"{path}: has more than {most_bytes / 1e6:,.1f} MB, the most that is valid")
     return content

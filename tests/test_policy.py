@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +80,11 @@ def test_a_network_of_several_agents_reads_each_feature_once() -> None:
     [
         ({"std": np.zeros(13)}, r"std \(13,\) of mean \(13,\); valid is above 0"),
         ({"mean": np.full(13, np.nan)}, "mean has nan; valid is finite"),
+        ({"mean": np.full(13, 1e39)}, r"mean has 1e\+39; valid is finite numbers of f32"),
+        ({"std": np.full(13, 1e-60)}, r"std \(13,\) of mean \(13,\); valid is above 0"),
+        ({"clip": 1e39}, r"clip 1e\+39; valid is a positive number of f32"),
+        ({"layers": ((np.full((6, 13), -1e39), np.zeros(6)),)}, r"weight of layer 0 has -1e\+39"),
+        ({"layers": ((np.zeros((6, 13)), np.full(6, 1e39)),)}, r"bias of layer 0 has 1e\+39"),
         (
             {"layers": ((np.zeros((6, 12)), np.zeros(6)),)},
             r"\(6, 12\).*valid is \(out, 13\)",
@@ -158,6 +166,45 @@ def test_damaged_and_foreign_files_are_one_error_that_names_the_file(tmp_path: P
         with pytest.raises(SdcError, match=WEIGHTS) as failed:
             Policy.load(tmp_path)
         assert "\n" not in str(failed.value)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda x: x["interface"]["features"]["agent_bat"][0].update(size=10**9),
+        lambda x: x["interface"]["features"]["agent_bat"][0].update(size=10**30),
+        lambda x: x["interface"]["features"]["agent_bat"].extend(
+            500 * x["interface"]["features"]["agent_bat"]
+        ),
+        lambda x: x["interface"].update(crac_units=10**12, commands={"agent_bat": ["cooling"]}),
+        lambda x: x["networks"][0].update(sizes=[10**9, *x["networks"][0]["sizes"][1:]]),
+        lambda x: x["networks"][0].update(choices=10**12),
+    ],
+    ids=["entries", "more entries", "features", "units", "units of a layer", "choices"],
+)
+def test_sizes_in_the_header_are_compared_with_the_weights_before_memory_is_taken(
+    edit: Callable[[Any], None], tmp_path: Path
+) -> None:
+    from safetensors.numpy import load, save
+
+    policy(interface(agents=("agent_bat",))).save(tmp_path)
+    path = tmp_path / WEIGHTS
+    described = json.loads((tmp_path / "policy.json").read_text())
+    edit(described)
+    path.write_bytes(save(load(path.read_bytes()), {"policy": json.dumps(described)}))
+    tracemalloc.start()
+    with pytest.raises(SdcError, match=WEIGHTS):
+        Policy.load(tmp_path)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 40 * path.stat().st_size + 1e6
+
+
+def test_outputs_beyond_f32_are_an_error() -> None:
+    net = network(("agent_bat",), 13, 6)
+    huge = replace(net, layers=tuple((np.full_like(w, 3e38), b) for w, b in net.layers))
+    with pytest.raises(SdcError, match="network of agent_bat: outputs beyond the range of f32"):
+        huge.actions(np.ones((2, 13), dtype=np.float32))
 
 
 # Interfaces

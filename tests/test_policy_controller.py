@@ -215,9 +215,36 @@ def test_a_policy_runs_no_code_that_its_file_names(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"others of its training: .*code that a file names"):
         make_controller(f"policy:{tmp_path}", fleet)
     assert commands_of(make_controller(f"battery=policy:{tmp_path}", fleet)) == ("battery",)
-    of_the_battery(f"policy:{tmp_path}").save(tmp_path)
-    with pytest.raises(ConfigError, match="its training had this policy for others"):
-        make_controller(f"policy:{tmp_path}", fleet)
+
+
+@pytest.mark.parametrize(
+    ("names", "loads", "message"),
+    [
+        (["a"], 1, "its training had this policy for others"),
+        (["a", "../x/b"], 2, "its training had this policy for others"),
+        ([*"abcdefghijkl"], 8, "is that of others in 8 trainings, one within the other"),
+    ],
+)
+def test_policies_for_others_end(
+    names: list[str],
+    loads: int,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "x").mkdir()
+    monkeypatch.chdir(tmp_path / "x")
+    for name, others in zip(names, [*names[1:], names[0]], strict=True):
+        of_the_battery(f"policy:{others}").save(Path(name))
+    loaded: list[Path] = []
+    load = Policy.load
+    monkeypatch.setattr(Policy, "load", lambda x: (loaded.append(x), load(x))[1])
+    fleet = build_fleet(load_config("tiny"))
+    for _ in range(2):
+        loaded.clear()
+        with pytest.raises(ConfigError, match=message):
+            make_controller("policy:a", fleet)
+        assert len(loaded) == loads
 
 
 def test_a_policy_acts_for_the_agents_that_do_not_learn(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.sim import snapshot
-from sdc_taichi.user_file import decoding, open_input
+from sdc_taichi.user_file import decoding, open_input, read_bytes
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "weather.epw": read_epw,
@@ -75,6 +76,22 @@ def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> 
         file.writestr("soc.npy", b"\x93NUMPY\x02\x00" + (1 << 30).to_bytes(4, "little"))
     with pytest.raises(SdcError, match=r"state\.npz: cannot be read as array soc"):
         snapshot.read(path)
+
+
+def test_a_file_takes_the_memory_of_its_content(tmp_path: Path) -> None:
+    path = tmp_path / "small"
+    path.write_bytes(b"x" * 1000)
+    tracemalloc.start()
+    assert read_bytes(path, 2**28) == b"x" * 1000
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 1e6
+    with pytest.raises(SdcError, match=r"valid is at most 0\.0 MB"):
+        read_bytes(path, 999)
+    if Path("/proc/self/status").exists():  # a file whose size is 0 until it is read
+        assert read_bytes("/proc/self/status", 2**20).startswith(b"Name:")
+        with pytest.raises(SdcError, match="has more than 0"):
+            read_bytes("/proc/self/status", 10)
 
 
 def test_errors_are_of_one_class_and_keep_their_cause(tmp_path: Path) -> None:

@@ -23,6 +23,11 @@ from sdc_taichi.learning.policy import Policy
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F32, I64, Actions
 
+_MOST_NESTED = 8
+"""Maximum number of policies of which each is the controller of others in the previous one."""
+_loading: list[Path] = []
+"""Folders of the policies that are being made, each for the others of the previous one."""
+
 
 class PolicyController:
     """Controller that runs a policy; agents without a network act as they did in the training.
@@ -135,10 +140,18 @@ def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> Policy
     """
     if not text:
         raise ConfigError("controller 'policy': valid is policy:FOLDER, such as policy:runs/happo")
+    folder = Path(text).resolve()
+    if folder in _loading:
+        raise ConfigError(f"policy {text}: its training had this policy for others")
+    if len(_loading) == _MOST_NESTED:
+        raise ConfigError(
+            f"policy {text}: is that of others in {_MOST_NESTED} trainings, one within the other; "
+            "valid are fewer"
+        )
+    # If the spec names further controllers, the policy sets only the commands of its agents.
+    others = None if set(parts) == set(CONTROLLABLE) else "idle"
+    _loading.append(folder)
     try:
-        policy = Policy.load(Path(text))
-        # If the spec names further controllers, the policy sets only the commands of its agents.
-        others = None if set(parts) == set(CONTROLLABLE) else "idle"
-        return PolicyController(policy, fleet, f"policy {text}", others)
-    except RecursionError:
-        raise ConfigError(f"policy {text}: its training had this policy for others") from None
+        return PolicyController(Policy.load(Path(text)), fleet, f"policy {text}", others)
+    finally:
+        _loading.pop()

@@ -97,6 +97,8 @@ class PolicyNetwork:
             raise SdcError(
                 f"{who}: std {std.shape} of mean {mean.shape}; valid is above 0 for each"
             )
+        if not 0.0 < self.clip <= float(np.finfo(np.float32).max):
+            raise SdcError(f"{who}: clip {self.clip}; valid is a positive number of f32")
         layers, width = [], len(mean)
         for i, arrays in enumerate(self.layers):
             weight = _numbers(arrays[0], f"{who}: weight of layer {i}", 2)
@@ -136,6 +138,11 @@ class PolicyNetwork:
     def actions(self, observations: F32) -> F32 | I64:
         """Return actions for observations, (B, k): option indices, or numbers within -1..1."""
         scores = self.scores(observations)
+        if not np.isfinite(scores).all():
+            raise SdcError(
+                f"network of {', '.join(self.agents)}: outputs beyond the range of f32; valid are "
+                "smaller weights"
+            )
         if self.head == "argmax":
             return np.asarray(scores.reshape(len(scores), -1, self.choices).argmax(axis=2))
         return np.asarray(np.tanh(scores) if self.head == "tanh" else np.clip(scores, -1.0, 1.0))
@@ -259,11 +266,16 @@ class Policy:
                 f"policy: networks of {', '.join(served)}; valid is one for each of "
                 f"{', '.join(self.interface.agents)}"
             )
+        for network in self.networks:
+            # The weights limit the memory that the sizes of features, numbers in a header, take.
+            width = max(map(self.interface.width, network.agents))
+            if width > network.sizes[0]:
+                raise SdcError(_inputs_differ(network, width))
         for network, entries in zip(self.networks, self.entries, strict=True):
             who = f"policy: network of {', '.join(network.agents)}"
             width = sum(len(np.arange(self.interface.width(a))[e]) for a, e in entries.items())
             if network.sizes[0] != width:
-                raise SdcError(f"{who} has {network.sizes[0]} inputs; observations have {width}")
+                raise SdcError(_inputs_differ(network, width))
             numbers = sum(map(self.interface.action_width, network.agents))
             if network.action_width != numbers:
                 raise SdcError(
@@ -379,6 +391,14 @@ class Policy:
             raise SdcError(f"{path}: {error}") from None
 
 
+def _inputs_differ(network: PolicyNetwork, width: int) -> str:
+    """Return the message about a network whose observations have another number of entries."""
+    return (
+        f"policy: network of {', '.join(network.agents)} has {network.sizes[0]} inputs; "
+        f"observations have {width}"
+    )
+
+
 def action_levels(number: int) -> F32:
     """Return equally spaced levels from -1 to 1 for continuous actions, (number,)."""
     return np.linspace(-1.0, 1.0, number, dtype=np.float32)
@@ -464,8 +484,10 @@ def _numbers(values: Any, what: str, ndim: int) -> F32:
     array = np.asarray(values)
     if array.dtype.kind != "f" or array.ndim != ndim:
         raise SdcError(f"{what} is {array.dtype} {array.shape}; valid is {ndim}-D, of real numbers")
-    if not np.all(np.isfinite(array)):
-        raise SdcError(f"{what} has {array[~np.isfinite(array)].flat[0]}; valid is finite numbers")
-    copy = np.array(array, dtype=np.float32, order="C")
+    with np.errstate(over="ignore"):
+        copy = np.array(array, dtype=np.float32, order="C")
+    if not np.all(np.isfinite(copy)):
+        odd = array[~np.isfinite(copy)].flat[0]
+        raise SdcError(f"{what} has {odd}; valid is finite numbers of f32")
     copy.flags.writeable = False
     return copy
