@@ -238,7 +238,12 @@ def test_policies_for_others_end(
         of_the_battery(f"policy:{others}").save(Path(name))
     loaded: list[Path] = []
     load = Policy.load
-    monkeypatch.setattr(Policy, "load", lambda x: (loaded.append(x), load(x))[1])
+
+    def counted(folder: Path) -> Policy:
+        loaded.append(folder)
+        return load(folder)
+
+    monkeypatch.setattr(Policy, "load", counted)
     fleet = build_fleet(load_config("tiny"))
     for _ in range(2):
         loaded.clear()
