@@ -136,6 +136,73 @@ def test_torchrl_env_gives_what_the_batch_gives(example: Load) -> None:
     twin.close()
 
 
+WRAPPED: dict[str, Callable[[], Any]] = {
+    "parallel_env": lambda: sdc_taichi.parallel_env(days=1),
+    "aec_env": lambda: sdc_taichi.aec_env(days=1),
+    "make": lambda: gymnasium.make("sdc_taichi/Battery-v0", days=1),
+    "make-Joint": lambda: gymnasium.make("sdc_taichi/Joint-v0", days=1, actions="continuous"),
+    "make_vec-SameStep": lambda: gymnasium.make_vec("sdc_taichi/Joint-v0", 2, **SAME_STEP),
+    "make_vec-Disabled": lambda: gymnasium.make_vec(
+        "sdc_taichi/Joint-v0", 2, days=1, autoreset_mode="Disabled"
+    ),
+}
+"""Environments that the wrappers of TorchRL take, by interface."""
+
+
+@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested:UserWarning")
+@pytest.mark.parametrize("interface", WRAPPED)
+def test_torchrl_wrappers_take_environments(interface: str, example: Load) -> None:
+    example("torchrl_env", "torchrl", "tensordict")
+    envs = importlib.import_module("torchrl.envs")
+    made = WRAPPED[interface]()
+    has_agents = not isinstance(made, gymnasium.Env | gymnasium.vector.VectorEnv)
+    if has_agents:
+        env = envs.PettingZooWrapper(made, return_state=True, use_mask=interface == "aec_env")
+    else:
+        env = envs.GymWrapper(made)
+    importlib.import_module("torchrl.envs.utils").check_env_specs(env)
+    day = DAY * (len(AGENTS) if interface == "aec_env" else 1)  # AEC agents step in turn
+    rollout = env.rollout(day + 2, break_when_any_done=False)
+    assert rollout.shape[-1] == day + 2
+    assert rollout["next", "done"].flatten()[: day + 2].nonzero().flatten().tolist() == [day - 1]
+    if interface == "parallel_env":
+        before, after = (x["agent_dc", "info", "it_kwh"] for x in (rollout, rollout["next"]))
+        assert before[0] == 0.0
+        assert (after > 0.0).all()
+    env.close()
+
+
+# --- BenchMARL ---
+
+BENCHMARL = """
+import train_benchmarl
+for seed in (0, 0):
+    train_benchmarl.main(
+        [
+            *("--num-envs", "2", "--days", "1", "--rollout", "24", "--steps", "96"),
+            *("--seed", str(seed)),
+        ]
+    )
+"""
+
+
+def test_benchmarl_trains_all_agents_reproducibly(example: Load) -> None:
+    """In a process of its own, whose warnings end with it."""
+    pytest.importorskip("benchmarl", reason="benchmarl is not installed: make test-train")
+    done = subprocess.run(
+        [sys.executable, "-c", BENCHMARL],
+        env=os.environ | {"PYTHONPATH": str(EXAMPLES)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    returns = [line for line in done.stdout.splitlines() if "mean episode return" in line]
+    assert [line.partition(":")[0] for line in returns] == ["untrained", "trained"] * 2
+    assert all(agent in line for line in returns for agent in AGENTS)
+    assert returns[:2] == returns[2:]
+    assert returns[0].partition(":")[2] != returns[1].partition(":")[2]
+
+
 # --- RLlib ---
 
 RLLIB = """
