@@ -48,6 +48,8 @@ PAGES = [
 POLICY = ROOT / "tests" / "reference" / "benchmark" / "carbon" / "ippo"
 NOT_RUN = ("train", "evaluate", "benchmark")
 """Commands that take long or need an extra: it is seen that they are valid."""
+SHOWN = ("train",)
+"""Those of them that check all values if they are to show them, and are not resumed."""
 _NOT_RUN_MARK = re.compile(r"<!-- not run: .+ -->\s*\Z")
 _LINE = re.compile(r"^ {4}(\S.*)$", re.M)
 _SYNOPSIS = re.compile(r"^# Command line\n\n(?: {4}.*\n)+", re.M)
@@ -123,7 +125,9 @@ def run(line: str) -> None:
     if program == "pip":
         return
     assert program == "sdc-taichi", line
-    if words[0] in NOT_RUN:
+    if words[0] in SHOWN and "--resume" not in words:
+        words = [*words, "--show"]
+    elif words[0] in NOT_RUN:
         check(words)
         return
     done = CliRunner().invoke(app, words)

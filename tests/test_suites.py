@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from policies import interface, network
 from sdc_taichi import ConfigError
@@ -22,6 +23,7 @@ from sdc_taichi.benchmark.suite import (
     suite_names,
 )
 from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs, run_suite, study_of
+from sdc_taichi.cli.app import app
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.policy import About, Policy
 
@@ -154,6 +156,46 @@ def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: 
     assert quick_form.cases["tiny"].days == 2
     assert set(whole.rows) - set(quick_form.rows) == {"ippo"}
     assert make_suite(yaml.safe_load(quick_form.to_yaml())) == quick_form
+
+
+@pytest.mark.parametrize("name", suite_names())
+@pytest.mark.parametrize("options", [(), ("--quick",), ("--rows", "idle", "--seeds", "3")])
+def test_what_is_shown_is_a_whole_suite(
+    tmp_path: Path, name: str, options: tuple[str, ...]
+) -> None:
+    shown = CliRunner().invoke(app, ["benchmark", name, "--show", *options])
+    assert shown.exit_code == 0, shown.output
+    file = tmp_path / "mine.yaml"
+    file.write_text(shown.stdout)
+    suite = load_suite(name, quick="--quick" in options)
+    if "--rows" in options:
+        suite = suite.chosen(rows=["idle"], seeds=3)
+    assert load_suite(str(file)) == suite
+    assert bool(suite.quick) == (options != ("--quick",))
+    if suite.quick:
+        quick = load_suite(str(file), quick=True)
+        whole = load_suite(name, quick=True)
+        assert quick == (
+            whole.chosen(rows=["idle"], seeds=quick.seeds) if "--rows" in options else whole
+        )
+
+
+def test_the_quick_form_of_chosen_cases_and_rows_is_whole(tmp_path: Path) -> None:
+    cases = {"tiny": SMALL["cases"]["tiny"], "other": SMALL["cases"]["tiny"]}
+    quick = {
+        "cases": {"tiny": {"sites": ["NY"]}, "other": {"sites": ["CA"]}},
+        "rows": {
+            "ippo": None,
+            "idle": {"cases": ["tiny", "other"]},
+            "random": {"cases": ["other"]},
+        },
+    }
+    suite = make_suite(SMALL | {"cases": cases, "quick": quick})
+    file = tmp_path / "mine.yaml"
+    file.write_text(suite.chosen(cases=["tiny"], rows=["idle", "random"]).to_yaml())
+    quick_form = load_suite(str(file), quick=True)
+    assert (list(quick_form.cases), list(quick_form.rows)) == (["tiny"], ["idle"])
+    assert quick_form.cases["tiny"].sites == ("NY",)
 
 
 def test_the_test_may_be_of_other_data_centers() -> None:

@@ -249,8 +249,8 @@ class Suite(Section):
         return self
 
     def to_yaml(self) -> str:
-        """Return all values except ``quick`` as YAML text."""
-        values = self.model_dump(mode="json", exclude={"quick"}, exclude_defaults=True)
+        """Return the suite as YAML text, from which ``load_suite`` reads an equal suite."""
+        values = self.model_dump(mode="json", exclude_defaults=True)
         return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
     def is_for(self, row: str, case: str) -> bool:
@@ -292,6 +292,15 @@ class Suite(Section):
                     del values["rows"][name]
         if not values["rows"]:
             raise ConfigError(f"suite {self.name}: none of these rows is for these cases")
+        for kind in values["quick"].keys() & {"cases", "rows"}:
+            changes = values["quick"][kind]
+            values["quick"][kind] = {k: v for k, v in changes.items() if k in values[kind]}
+        for name, changes in values["quick"].get("rows", {}).items():
+            if changes and changes.get("cases"):
+                remaining = [case for case in changes["cases"] if case in values["cases"]]
+                values["quick"]["rows"][name] = (
+                    {**changes, "cases": remaining} if remaining else None
+                )
         return make_suite(values, f"suite {self.name}")
 
 
