@@ -122,7 +122,6 @@ def test_the_command_shows_the_settings_that_it_would_train_with(tmp_path: Path)
         (["--resume", "--out", "none"], "none: holds no training"),
         (["--settings", "none.yaml"], "none.yaml: no such file"),
         (["ippo", "environment.rewards=energy", "--show"], "environment: unknown key"),
-        (["ippo", "--site", "atlantis", "--show"], "atlantis"),
     ],
 )
 def test_errors_of_the_command_are_one_line(arguments: list[str], said: str) -> None:

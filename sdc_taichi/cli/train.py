@@ -120,7 +120,7 @@ def train_command(
     if resume and out is None:
         raise ConfigError("--resume: without --out; valid is with the folder of a training")
     chosen = _settings(values, source, assigned or [], settings, out if resume else None)
-    chosen.data_centers_of_sites()  # Refuse unknown fields and sites before anything is shown.
+    chosen.data_centers_of_sites()  # Refuse unknown fields before anything is shown.
     if show:
         print(chosen.to_yaml(), end="")
         return
