@@ -518,6 +518,7 @@ INTERFACES: dict[str, Callable[..., Any]] = {
     ),
 }
 """Every interface of the environments, in every mode of batches."""
+BATCHES = [name for name in INTERFACES if name.startswith(("vector_env", "make_vec"))]
 
 
 def infos_of_steps(env: Any, steps: int) -> list[dict[str, Any]]:
@@ -609,6 +610,52 @@ def test_bad_actions_of_one_learner() -> None:
     batch.reset(seed=0)
     with pytest.raises(SdcError, match=re.escape("shape (3,), expected (2,)")):
         batch.step(np.array([1, 1, 1]))
+
+
+@pytest.mark.parametrize("clips", [None, True, False])
+@pytest.mark.parametrize("interface", ["parallel_env", "aec_env", "make_joint", *BATCHES])
+def test_actions_out_of_range_are_clipped_or_refused(interface: str, clips: bool | None) -> None:
+    env = INTERFACES[interface](**tiny(actions="continuous", clip_actions=clips))
+    env.reset(seed=0)
+
+    def step(value: float) -> Any:
+        if hasattr(env, "agent_iter"):
+            for agent in AGENTS:
+                env.step(np.full(env.action_space(agent).shape, value))
+            return env.rewards
+        if not hasattr(env, "action_spaces"):
+            return env.step(np.full(env.action_space.shape, value))[1]
+        size = (env.num_envs,) if interface in BATCHES else ()
+        actions = {a: np.full((*size, *s.shape), value) for a, s in env.action_spaces.items()}
+        return env.step(actions)[1]
+
+    if clips or (clips is None and interface in BATCHES):
+        rewards = [step(1.0)]
+        for value in (1.0001, 7.0):
+            env.reset(seed=0)
+            rewards.append(step(value))
+        assert all(same(one, rewards[0]) for one in rewards)
+        env.reset(seed=0)
+        assert not same(step(0.9), rewards[0])
+    else:
+        with pytest.raises(SdcError, match=r"1.0001; valid is within -1..1, or any number with"):
+            step(1.0001)
+    for value in (np.nan, np.inf):
+        env.reset(seed=0)
+        with pytest.raises(SdcError, match=f"{value}; valid is "):
+            step(value)
+    env.close()
+
+
+def test_clipping_is_no_part_of_a_saved_state() -> None:
+    clips, refuses = (
+        sdc_taichi.parallel_env(**tiny(actions="continuous", clip_actions=c)) for c in (True, False)
+    )
+    clips.reset(seed=0)
+    clips.step({a: np.array([7.0]) for a in AGENTS})
+    refuses.load_state_dict(clips.state_dict())
+    idle = {a: np.array([0.0]) for a in AGENTS}
+    assert same(clips.step(idle), refuses.step(idle))
 
 
 @pytest.mark.parametrize("kind", ["make_vec", "vector_env"])
@@ -713,10 +760,8 @@ def test_pettingzoo_only_warns_of_an_unknown_reset_option() -> None:
     ],
 )
 def test_malformed_actions(mode: str, actions: Any, message: str) -> None:
-    single, batch = (
-        sdc_taichi.parallel_env(**tiny(actions=mode)),
-        multi_agent(1, **tiny(actions=mode)),
-    )
+    options = tiny(actions=mode) | ({"clip_actions": False} if mode == "continuous" else {})
+    single, batch = sdc_taichi.parallel_env(**options), multi_agent(1, **options)
     of_batch = actions and {agent: [action] for agent, action in actions.items()}
     for env, chosen in ((single, actions), (batch, of_batch)):
         env.reset(seed=0)

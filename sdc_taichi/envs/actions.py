@@ -33,6 +33,7 @@ class AgentActions:
     Args:
         fleet: the B data centers, with U CRAC units and R racks in total.
         options: learning agents, their commands and the meaning of their actions.
+        clip: whether continuous actions are clipped to -1..1 if ``options.clip_actions`` is None.
 
     Attributes:
         spaces: action space of each learning agent in one environment.
@@ -44,7 +45,8 @@ class AgentActions:
             control, or a model of the fleet does not accept a command.
     """
 
-    def __init__(self, fleet: Fleet, options: EnvOptions) -> None:
+    def __init__(self, fleet: Fleet, options: EnvOptions, *, clip: bool = False) -> None:
+        self._clip = clip if options.clip_actions is None else options.clip_actions
         self._agents: tuple[str, ...] = options.agents
         self._continuous = options.actions == "continuous"
         decided = {agent: options.commands_of(agent) for agent in self._agents}
@@ -157,7 +159,7 @@ class AgentActions:
                 f"action of {agent}: shape {action.shape}, expected {self._shapes[agent]}"
             )
         if self._continuous:
-            return _checked_numbers(agent, action)
+            return _checked_numbers(agent, action, clip=self._clip)
         whole = action.dtype.kind in "iu"
         if whole:
             choices = action.astype(np.int64)
@@ -256,13 +258,25 @@ def _columns(
     )
 
 
-def _checked_numbers(agent: str, action: npt.NDArray[Any]) -> F64:
-    """Check a continuous action and clip values that exceed -1..1 by rounding in f32."""
+def _checked_numbers(agent: str, action: npt.NDArray[Any], *, clip: bool) -> F64:
+    """Check a continuous action and clip it to -1..1.
+
+    Args:
+        agent: name of the agent in error messages.
+        action: numbers, (B, k).
+        clip: True to clip all finite values, False only those that exceed -1..1 by rounding in f32.
+
+    Raises:
+        SdcError: the action has other values.
+    """
     if action.dtype.kind not in "iuf":
         raise SdcError(f"action of {agent}: {action.flat[0]!r}; valid is a number")
-    inside = np.abs(action) <= 1.0 + 1e-6
-    if not np.all(inside):
-        raise SdcError(f"action of {agent}: {action[~inside].flat[0]}; valid is within -1..1")
+    valid = np.isfinite(action) if clip else np.abs(action) <= 1.0 + 1e-6
+    if not np.all(valid):
+        wrong = action[~valid].flat[0]
+        range_text = "a finite number" if clip else "within -1..1"
+        advice = "" if clip or not np.isfinite(wrong) else ", or any number with clip_actions=True"
+        raise SdcError(f"action of {agent}: {wrong}; valid is {range_text}{advice}")
     return np.minimum(np.maximum(action.astype(np.float64), -1.0), 1.0)
 
 

@@ -84,7 +84,8 @@ class Environment:
         configs, chosen = configs_and_options(config, overrides, options, keywords, only_agent)
         if isinstance(self, SingleEnv) and len(configs) != 1:
             raise ConfigError(f"config: {len(configs)} data centers; valid is one, or vector_env")
-        self.core = Core(configs, chosen, num_envs, precision, recorder)
+        batched = isinstance(self, BatchEnv)
+        self.core = Core(configs, chosen, num_envs, precision, recorder, clip_actions=batched)
         self.render_mode = render_mode
         self.state_space = self.core.state_space
 

@@ -87,6 +87,7 @@ class Core:
         num_envs: number of environments; None creates one per config.
         precision: floating-point precision of the server kernels.
         recorder: choice and destination of recorded episodes; None records nothing.
+        clip_actions: value of ``options.clip_actions`` if that is None.
 
     Attributes:
         options: actions, observations and rewards of the agents.
@@ -110,6 +111,8 @@ class Core:
         num_envs: int | None = None,
         precision: Precision = "f32",
         recorder: RecorderOption = None,
+        *,
+        clip_actions: bool = False,
     ) -> None:
         size = _checked_size(num_envs, len(configs))
         self.options = options
@@ -138,14 +141,15 @@ class Core:
             days=options.days,
         )
         self._costs = Costs(options.costs, fleet)
-        # Plain values that identify the environment in saved states. Costs are left out because
-        # they do not change an episode.
-        self._identity = options.model_dump(exclude={"rewards", "costs", "others"}) | {
+        # Plain values that identify the environment in saved states. Costs and the clipping of
+        # actions are left out because they do not change an episode.
+        without_effect = {"costs", "clip_actions"}
+        self._identity = options.model_dump(exclude={"rewards", "others", *without_effect}) | {
             "rewards": self._rewards.identity,
             "others": controller_text(options.others),
         }
         self._observer = make_observer(fleet, options, new_inputs=draws_inputs(options))
-        self._decoder = AgentActions(fleet, options)
+        self._decoder = AgentActions(fleet, options, clip=clip_actions)
         self.features: dict[str, tuple[Feature, ...]] = {
             a: self._observer.features[a] for a in self.agents
         }

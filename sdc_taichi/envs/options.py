@@ -87,6 +87,10 @@ class EnvOptions(BaseModel):
     fan_change: Annotated[float, Field(ge=0.001, le=1)] = 0.2
     """Change of the CRAC fan speed in one step at a continuous action of 1, as a share of full
     speed, 0.001..1. This is the largest change."""
+    clip_actions: bool | None = None
+    """True to clip continuous actions to -1..1, because Gaussian policies exceed this range; False
+    to refuse actions outside it. Values that are not finite are always refused. None means True in
+    the batches of ``gymnasium.make_vec`` and ``vector_env``, and False elsewhere."""
     days: Annotated[int, Field(strict=True, ge=1, le=365), PLAIN_INT] = 7
     """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"
@@ -216,7 +220,7 @@ class EnvOptions(BaseModel):
                 "as agent_bat does not learn; valid where it does",
             ),
             (
-                ("setpoint_change_k", "fan_change"),
+                ("setpoint_change_k", "fan_change", "clip_actions"),
                 not continuous,
                 "with actions discrete; valid with continuous",
             ),
