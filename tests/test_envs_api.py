@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
@@ -644,6 +645,19 @@ def test_actions_out_of_range_are_clipped_or_refused(interface: str, clips: bool
         env.reset(seed=0)
         with pytest.raises(SdcError, match=f"{value}; valid is "):
             step(value)
+    env.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_gymnasium_counts_the_steps_of_episodes(mode: AutoresetMode) -> None:
+    batch = gymnasium.make_vec("sdc_taichi/Battery-v0", 2, autoreset_mode=mode, **tiny())
+    env = RecordEpisodeStatistics(batch)
+    env.reset(seed=0)
+    for _ in range(2 * STEPS + 2):
+        env.step(np.array([1, 1]))
+    old = tuple(map(int, gymnasium.__version__.split(".")[:2])) < (1, 4)
+    short = old and mode is AutoresetMode.SAME_STEP  # as docs/environments.md says
+    assert list(env.length_queue) == [STEPS, STEPS, *[STEPS - short] * 2]
     env.close()
 
 
