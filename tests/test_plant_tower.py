@@ -13,6 +13,7 @@ from model_steps import assert_batch, floating_point_errors  # noqa: F401
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant import tower
 from sdc_taichi.plant.tower import TOWERS, TowerPoint, TowerResult
+from sdc_taichi.plant.water import WATER, WaterPoint
 
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
 wet_bulbs = st.floats(-34.4, 26.7)
@@ -124,7 +125,8 @@ def test_heat_balance_bounds_and_batch(
         assert (result.approach_k[above] >= 0.0).all()
         # The mean cube of the speeds of a fan that goes on and off is at most their mean.
         assert (result.fan_w <= DESIGN_FAN_W * result.air_ratio * (1.0 + 1e-9)).all()
-        assert (result.air_ratio[np.array(heat) > 0.0] >= tower.FREE_CONVECTION_SHARE).all()
+        assert (result.air_ratio[result.fan_w > 0.0] >= tower.FREE_CONVECTION_SHARE).all()
+        assert (result.air_ratio[np.array(heat) > 0.0] > 0.0).all()
 
 
 @given(st.floats(1e4, 3e6), st.floats(-30.0, 30.0))
@@ -156,8 +158,54 @@ def test_fan_is_off_once_free_convection_carries_the_heat() -> None:
     result = run("yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=setpoint_c)
     assert 0.0 < result.fan_w[0] < 0.01 * 0.2**3 * DESIGN_FAN_W
     assert result.fan_w[1] == 0.0
-    assert result.air_ratio[1] == tower.FREE_CONVECTION_SHARE
+    np.testing.assert_allclose(result.air_ratio, tower.FREE_CONVECTION_SHARE, rtol=5e-3)
     np.testing.assert_allclose(result.leaving_c, setpoint_c)
+
+
+@pytest.mark.parametrize("wet_bulb_c", [-20.0, 0.0, 15.0, 26.0])
+@pytest.mark.parametrize("approach_k", [9.0, 15.0, 25.0])
+def test_air_at_rest_is_proportional_to_a_small_heat(wet_bulb_c: float, approach_k: float) -> None:
+    heat_w = 1e3 * np.array([1e-3, 0.1, 1.0, 10.0])
+    result = run(
+        "yorkcalc",
+        heat_w,
+        wet_bulb_c=wet_bulb_c,
+        condenser_setpoint_c=wet_bulb_c + approach_k,
+        water_kg_s=0.2 * WATER_KG_S,
+    )
+    np.testing.assert_array_equal(result.fan_w, 0.0)
+    per_w = result.air_ratio / heat_w
+    np.testing.assert_allclose(per_w[:3], per_w[0], rtol=0.05)
+    assert np.all(result.air_ratio > 0.0)
+    assert np.all(result.air_ratio < tower.FREE_CONVECTION_SHARE)
+
+
+@pytest.mark.parametrize("dry_k", [0.0, 8.0, 22.0])
+@pytest.mark.parametrize("wet_bulb_c", [-10.0, 5.0, 15.0, 24.0])
+def test_a_tower_at_rest_evaporates_what_its_heat_and_the_warmth_of_its_air_allow(
+    wet_bulb_c: float, dry_k: float
+) -> None:
+    heat_w = HEAT_W * np.geomspace(1e-4, 0.2, 40)
+    water_kg_s = np.maximum(WATER_KG_S * heat_w / HEAT_W, 0.2 * WATER_KG_S)
+    outdoor_c, pressure_pa, design_m3s = wet_bulb_c + dry_k, 101_325.0, 2.667e-5 * HEAT_W
+    done = run(
+        "yorkcalc",
+        heat_w,
+        wet_bulb_c=wet_bulb_c,
+        condenser_setpoint_c=wet_bulb_c + 6.0,
+        water_kg_s=water_kg_s,
+    )
+    air_m3s = done.air_ratio * design_m3s
+    place = (outdoor_c, wet_bulb_c, pressure_pa, 30.0, 18.0, 5.0, 0.0, 1.0)
+    water = WATER["saturated_exit"](WaterPoint(heat_w, done.range_k, water_kg_s, air_m3s, *place))
+    at_rest = done.fan_w == 0.0
+    assert at_rest[0]
+    latent_w = water.evaporation_l[at_rest] * 2.45e6
+    # The air cools at most to the wet bulb, and gives the water that warmth.
+    warmth_w = 1.25 * 1006.0 * air_m3s[at_rest] * dry_k
+    assert np.all(latent_w <= 1.05 * (heat_w[at_rest] + warmth_w))
+    # The enthalpy that the air gains does not vanish with the heat.
+    assert np.max(latent_w / heat_w[at_rest]) < 1.0 + dry_k / 6.0
 
 
 def test_fan_goes_on_and_off_below_its_lowest_speed() -> None:

@@ -48,8 +48,9 @@ YORKCALC = np.array(
 range in K, and of the wet bulb in C."""
 WET_BULB_BOUNDS_C = (-34.4, 26.7)
 """Lowest and highest wet-bulb temperature at which YorkCalc is evaluated, in C."""
-MAX_RANGE_K = 22.2
-"""Largest range (entering minus leaving water) at which YorkCalc is evaluated, in K."""
+MIN_RANGE_K, MAX_RANGE_K = 1.1, 22.2
+"""Bounds of the range (entering minus leaving water) of the measurements behind YorkCalc, in K. It
+is evaluated up to the upper bound."""
 MAX_LIQUID_GAS_RATIO = 8.0
 """Largest liquid-to-gas ratio at which YorkCalc is evaluated."""
 
@@ -258,7 +259,8 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
     on and off at ``MIN_AIR_RATIO``. With the fan off the tower has the share f of its full-speed
     cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)). A tower with range r and fan off
     would thus have the range r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
-    bypass prevents water colder than the setpoint.
+    bypass prevents water colder than the setpoint: with the fan off, air and water pass each other
+    only as much as the heat needs, see ``_free_convection_share``.
     """
     range_k = _range_k(heat_w, point.water_kg_s)
     water_ratio = point.water_kg_s / point.reference_water_kg_s
@@ -275,7 +277,9 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
     # A cycling fan gives an approach that is linear in the share of time during which it is on.
     on_share = (fan_off_k - wanted_k) / np.maximum(fan_off_k - low_speed_k, _LEAST_K)
     on_share = np.where(loaded, np.clip(on_share, 0.0, 1.0), 0.0)
-    air_ratio = on_share * speed + (1.0 - on_share) * FREE_CONVECTION_SHARE
+    at_rest = _free_convection_share(point.wet_bulb_c, range_k, water_ratio, wanted_k)
+    free_ratio = FREE_CONVECTION_SHARE * np.where(on_share > 0.0, 1.0, at_rest)
+    air_ratio = on_share * speed + (1.0 - on_share) * free_ratio
     return _tower(
         on_share * fan_power_w(speed, design_fan_w=point.design_fan_w),
         np.where(loaded, air_ratio, 0.0),
@@ -383,6 +387,28 @@ def _fan_off_approach_k(wet_bulb_c: Values, range_k: Values, water_ratio: Values
     at_full_speed_k = range_k / FREE_CONVECTION_SHARE
     full_speed_k = _approach_at(water_ratio, *_approach_parabola(wet_bulb_c, at_full_speed_k))
     return as_array(full_speed_k + at_full_speed_k - range_k)
+
+
+def _free_convection_share(
+    wet_bulb_c: Values, range_k: Values, water_ratio: Values, wanted_k: Values
+) -> F64:
+    """Return the share of the tower's free convection that holds the water at its setpoint, 0..1.
+
+    Water that enters at wanted_k + range_k above the wet bulb is cooled by free convection by
+    f*e*(wanted_k + range_k). Here e = R/(A_full(R) + R) is the effectiveness at full fan speed,
+    range divided by the distance of the entering water from the wet bulb. It hardly depends on
+    the load (EnergyPlus Engineering Reference, variable speed towers, free convection and fluid
+    bypass). The bypass leads the rest of the water around the tower, so the airflow that takes up
+    the heat is proportional to the heat. Without it, air would evaporate water by its own warmth
+    alone, whatever the heat.
+    """
+    at_full_speed_k = range_k / FREE_CONVECTION_SHARE
+    # The approach of YorkCalc does not vanish with the range, below the bound of its measurements.
+    measured_k = np.maximum(at_full_speed_k, MIN_RANGE_K)
+    approach_k = _approach_at(water_ratio, *_approach_parabola(wet_bulb_c, measured_k))
+    effectiveness = measured_k / (approach_k + measured_k)
+    reached_k = effectiveness * np.maximum(wanted_k + range_k, _LEAST_K)
+    return as_array(np.minimum(at_full_speed_k / reached_k, 1.0))
 
 
 def _range_k(heat_w: Values, water_kg_s: Values) -> F64:
