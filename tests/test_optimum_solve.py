@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -132,14 +133,25 @@ def test_queues_of_whole_tasks_are_empty_at_the_end() -> None:
 def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_limit() -> None:
     config = config_of("NY", preset="corrected")
     found = solved(config, steps=6, agents=("cooling",), inlet_limit_c=20.0)
-    texts = found.failures[0]
-    assert any("path of idle" in text and "over the limit" in text for text in texts)
+    limit, *texts = found.failures[0]
+    measured = found.certificates[0]
+    over_k = float(solved(config, steps=6, agents=("battery",)).certificates[0]["hottest_inlet_c"])
+    assert any(f"path of idle commands has inlets up to {over_k - 20.0:.3g} K" in x for x in texts)
     assert not any("path of cooling" in text for text in texts)
-    assert found.certificates[0]["hottest_inlet_c"] > 20.0
+    assert 20.0 < measured["hottest_inlet_c"] <= measured["reachable_limit_c"] + 1e-3
+    least_c = float(re.findall(r"least reachable limit is ([\d.]+) C", limit)[0])
+    assert 0.0 <= least_c - measured["reachable_limit_c"] < 0.1
     with Simulator(config) as sim:
         score = begin_score(found, sim, 0)
         simulate(sim, AchievedPath(found), found.steps, on_step=score.add)
         assert achievement(found, "optimum", score).broken == ((),)
+        score = begin_score(found, sim, 0)
+        simulate(sim, make_controller("idle", sim.fleet), found.steps, on_step=score.add)
+        ((text,),) = achievement(found, "idle", score).broken
+        assert text.endswith(f"over {measured['hottest_inlet_c']:.2f} C")
+    reachable = solved(config, steps=6, agents=("cooling",), inlet_limit_c=least_c)
+    assert not any("least reachable" in text for text in reachable.failures[0])
+    assert reachable.certificates[0]["hottest_inlet_c"] <= least_c + 1e-3
 
 
 @pytest.mark.parametrize("preset", preset_names())

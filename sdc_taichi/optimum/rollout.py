@@ -389,6 +389,10 @@ class Certificate:
     over_limit_k: float
     """Maximum excess of an inlet over the limit, in K. In steps in which no setpoint satisfies the
     limit, the lowest inlet temperature of all setpoints takes its place."""
+    inlet_limit_c: float
+    """Limit of inlet temperatures, in C; inf without a limit."""
+    reachable_limit_c: float
+    """Lowest limit, at least ``inlet_limit_c``, that some setpoint satisfies in each step, in C."""
     unmet_kwh: float
     """Heat that the cooling does not remove from the room, in kWh."""
 
@@ -408,7 +412,10 @@ class Certificate:
             texts.append(f"ends with {more_tasks:.4g} tasks more in the queue")
         hot = ""
         if self.over_limit_k > LEAST_K:
-            hot = f"has inlets up to {self.over_limit_k:.3g} K over the limit"
+            over_k = self.hottest_inlet_c - self.inlet_limit_c
+            hot = f"has inlets up to {over_k:.3g} K over the limit of {self.inlet_limit_c:g} C"
+            if over_k > self.over_limit_k + LEAST_K:
+                hot += f", {self.over_limit_k:.3g} K over the least possible in a step"
         texts += broken_constraints(
             self.dropped_tasks - idle.dropped_tasks,
             (self.overdue_tasks, idle.overdue_tasks),
@@ -453,6 +460,9 @@ def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certif
     scored = slice(problem.scored_from, None)
     measured = done.facility_kwh[scored, 0]
     expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
+    limits_c = _reachable_limits_c(problem, done)
+    has_limit = np.isfinite(problem.inlet_limit_c)
+    over_k = done.inlet_max_c[:, 0] - limits_c if has_limit else np.zeros(problem.steps)
     return Certificate(
         figure=float(score.figure[i]),
         table_error=float(np.abs(expected[scored] - measured).sum() / measured.sum()),
@@ -463,25 +473,24 @@ def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certif
         dropped_tasks=float(score.dropped_tasks[i]),
         overdue_tasks=float(score.most_overdue_tasks[i]),
         hottest_inlet_c=float(score.hottest_inlet_c[i]),
-        over_limit_k=float(_over_limit_k(problem, done)[scored].max()),
+        over_limit_k=float(over_k[scored].max()),
+        inlet_limit_c=problem.inlet_limit_c,
+        reachable_limit_c=float(limits_c[scored].max()),
         unmet_kwh=float(score.unmet_kwh[i]),
     )
 
 
-def _over_limit_k(problem: Problem, done: RollOut) -> F64:
-    """Return the excess of the hottest inlet over its limit in each step, in K, (T,).
+def _reachable_limits_c(problem: Problem, done: RollOut) -> F64:
+    """Return the lowest limit of inlets that some setpoint satisfies in each step, in C, (T,).
 
-    If no setpoint satisfies the limit, the lowest inlet of all setpoints takes its place.
+    It is the limit of the problem where some setpoint satisfies this limit.
     """
     table, limit_c = problem.table, problem.inlet_limit_c
     if np.isinf(limit_c):
-        return np.zeros(problem.steps)
+        return np.full(problem.steps, limit_c)
     inlet_c, unmet_w = (
         at_utilisation(values, table.utilisation, done.utilisation[:, 0])
         for values in (table.inlet_max_c, table.unmet_w)
     )
     coolest_c = coolest_inlet_c(inlet_c, unmet_w)[:, 0]
-    within = coolest_c <= limit_c - INLET_MARGIN_K
-    return np.asarray(
-        done.inlet_max_c[:, 0] - np.where(within, limit_c, coolest_c + INLET_MARGIN_K)
-    )
+    return np.asarray(np.maximum(limit_c, coolest_c + INLET_MARGIN_K))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -32,6 +33,7 @@ from sdc_taichi.optimum.problem import (
 from sdc_taichi.optimum.result import BoundOfEnds, Optimum
 from sdc_taichi.optimum.rollout import (
     LARGEST_TABLE_ERROR,
+    LEAST_K,
     Certificate,
     RollOut,
     Targets,
@@ -239,15 +241,31 @@ class _Case:
                 for agent in self.problem.agents
             },
             kind=_kind(self.no_bound, error),
-            failures=tuple(
-                f"the path of {name} {text}" for name, texts in failures.items() for text in texts
+            failures=(
+                *_unreachable_limit(certificates[best]),
+                *(
+                    f"the path of {name} {text}"
+                    for name, texts in failures.items()
+                    for text in texts
+                ),
             ),
-            certificate=asdict(certificates[best])
-            | {"table_error": error, "inlet_limit_c": self.problem.inlet_limit_c},
+            certificate=asdict(certificates[best]) | {"table_error": error},
             load=done.load_command[:, 0],
             cooling=done.cooling_command[:, 0],
             battery=done.battery_command[:, 0],
         )
+
+
+def _unreachable_limit(best: Certificate) -> tuple[str, ...]:
+    """Return a text on the limit of inlets if no setpoint satisfies it in some step."""
+    if best.reachable_limit_c <= best.inlet_limit_c + LEAST_K:
+        return ()
+    least_c = math.ceil(10.0 * best.reachable_limit_c) / 10.0
+    return (
+        f"the limit of inlets of {best.inlet_limit_c:g} C, as no setpoint keeps it in each step: "
+        f"the least reachable limit is {least_c:.1f} C, and the achieved path has inlets up to "
+        f"{best.hottest_inlet_c:.2f} C",
+    )
 
 
 def _kind(reason: str | None, error: float) -> str:

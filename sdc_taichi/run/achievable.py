@@ -215,6 +215,9 @@ def _broken(optimum: Optimum, score: Score, dc: int) -> list[str]:
     limit_c, hottest_c = optimum.inlet_limit_c[dc], score.hottest_inlet_c[dc]
     if hottest_c > max(limit_c, best["hottest_inlet_c"]) + LEAST_K:
         hot = f"has an inlet of {hottest_c:.2f} C, over the limit of {limit_c:g} C"
+        if best["hottest_inlet_c"] > limit_c + LEAST_K:
+            # No path keeps the limit in each step.
+            hot = f"has an inlet of {hottest_c:.2f} C, over {best['hottest_inlet_c']:.2f} C"
     return broken_constraints(
         score.dropped_tasks[dc] - optimum.idle_dropped_tasks[dc],
         (score.most_overdue_tasks[dc], best["overdue_tasks"]),
