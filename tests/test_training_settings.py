@@ -10,7 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from sdc_taichi import EnvOptions
+from sdc_taichi.cli import train as train_command
 from sdc_taichi.cli.app import app
+from sdc_taichi.cli.terminal import duration
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.split import TRAINING
@@ -144,3 +146,31 @@ def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> N
     assert found.output.count("\n") == 1
     assert 'pip install "sdc-taichi[train]"' in found.output
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("solved", [True, False], ids=["solved", "in the cache"])
+def test_a_training_says_how_long_it_solves_optima(
+    solved: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("sdc_taichi.cli.train.time.monotonic", lambda: now_s)
+    weeks = make_settings({"algorithm": "ppo", "sites": ["ny", "ca"]}, "train").validation_weeks()
+    assert weeks == 14
+    with train_command._progress_of_training(weeks, shown=True) as reports:
+        on_stage = reports["on_stage"]
+        for stage, second_each in (("tables", 0.1), ("programmes", 3.0)) if solved else ():
+            for done in range(4):
+                on_stage(stage, done, 14)
+                now_s += second_each
+        for done in range(14):
+            on_stage("values of ends", done, 14)
+            now_s += 4.0 if solved else 0.01
+    lines = capsys.readouterr().err.splitlines()
+    if not solved:
+        assert lines == []
+        return
+    assert lines[0].startswith("First the optima of 14 validation weeks are solved, once")
+    of_programmes = 3.0 * (13 + train_command.ENDS_PER_PROGRAMME * 14)
+    left = duration(of_programmes)
+    assert lines[1] == f"programmes of 1/14 weeks; training begins in about {left}"
+    assert "values of ends of 1/14 weeks; training begins in about 0:52" in lines

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,6 +32,11 @@ if TYPE_CHECKING:
     from sdc_taichi.learning.evaluation import Validation
     from sdc_taichi.learning.trainer import Progress, Training
     from sdc_taichi.learning.training_settings import TrainingSettings
+
+
+ENDS_PER_PROGRAMME = 1.3
+"""Time for the values of ends of a week, divided by the time for its programmes. Measured with the
+default settings and two processors; used for the first estimate only."""
 
 
 def _algorithms() -> Iterable[str]:
@@ -127,7 +133,8 @@ def train_command(
     folder = Path("runs") / f"{chosen.algorithm}-{chosen.seed}" if out is None else out
     from sdc_taichi.learning import train
 
-    with interruptible() as interrupted, _progress_of_training(shown=not quiet) as reports:
+    weeks = chosen.validation_weeks()
+    with interruptible() as interrupted, _progress_of_training(weeks, shown=not quiet) as reports:
         done = train(chosen, folder, resume=resume, stop=interrupted, **reports)
     if not quiet:
         _print_summary(done)
@@ -201,10 +208,11 @@ def _agents(text: str) -> list[str]:
 
 
 @contextlib.contextmanager
-def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
+def _progress_of_training(weeks: int, *, shown: bool) -> Iterator[dict[str, Any]]:
     """Show the progress of a training on stderr: bars in a terminal, lines elsewhere.
 
     Args:
+        weeks: number of validation weeks of all sites together.
         shown: True to show progress.
 
     Yields:
@@ -214,7 +222,7 @@ def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
         yield {}
         return
     lines, has_lines = ProgressLines(), not sys.stderr.isatty()
-    begun: set[str] = set()
+    announce = _announcer_of_optima(weeks, lines if has_lines else None)
     with stage_bars(shown=True) as progress:
 
         def update(now: Progress) -> None:
@@ -225,11 +233,52 @@ def _progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
 
         def stage(name: str, done: int, total: int) -> None:
             progress(name, done, total)
-            if has_lines and name not in begun:
-                begun.add(name)
-                print(f"{name}: {total:,}", file=sys.stderr, flush=True)
+            announce(name, done, total)
 
         yield {"on_update": update, "on_stage": stage}
+
+
+def _announcer_of_optima(
+    weeks: int, lines: ProgressLines | None
+) -> Callable[[str, int, int], None]:
+    """Return a progress callback that says what is solved before a training, and how long it takes.
+
+    Args:
+        weeks: number of validation weeks of all sites together.
+        lines: printer of further lines; None if bars show the progress.
+    """
+    begun_s: dict[str, float] = {}
+    last_done: dict[str, int] = {}
+
+    def announce(stage: str, done: int, total: int) -> None:
+        now_s = time.monotonic()
+        if stage == "tables" and not begun_s:  # the first stage, unless all optima are known
+            print(
+                f"First the optima of {weeks} validation weeks are solved, once: later trainings "
+                "read them from the cache. --set validation.optimum=false trains without them.",
+                file=sys.stderr,
+                flush=True,
+            )
+        # The battery may be planned again, and then the programmes start anew.
+        if done < last_done.get(stage, 0) or stage not in begun_s:
+            begun_s[stage] = now_s
+        first_piece = done > 0 and not last_done.get(stage)
+        last_done[stage] = done
+        if stage not in ("programmes", "values of ends") or not done:
+            return
+        each_s = (now_s - begun_s[stage]) / done
+        left_s = each_s * (total - done)
+        if stage == "programmes":
+            left_s += ENDS_PER_PROGRAMME * each_s * total
+        if left_s < 1.0:
+            return
+        text = f"{stage} of {done}/{total} weeks; training begins in about {duration(left_s)}"
+        if lines is not None:
+            lines.print(text, always=first_piece)
+        elif first_piece:
+            print(text, file=sys.stderr, flush=True)
+
+    return announce
 
 
 def _line(now: Progress) -> str:

@@ -39,6 +39,7 @@ from sdc_taichi.learning.split import (
     DAYS_PER_WEEK,
     TRAINING,
     UNSCORED_DAYS,
+    VALIDATION,
     WEEKS,
     data_center_weeks,
 )
@@ -359,6 +360,11 @@ class TrainingSettings(Section):
         if tariff is not None:
             config = config.model_copy(update={"tariff": tariff})
         return make_configs(config, sites=self.sites)
+
+    def validation_weeks(self) -> int:
+        """Return the number of validation weeks of all sites together."""
+        weeks = self.validation.weeks
+        return max(len(self.sites), 1) * len(VALIDATION if weeks == "validation" else weeks)
 
     def difference(self, other: TrainingSettings) -> str | None:
         """Describe the first setting that differs, ignoring ``steps``; None if all are equal.
