@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import Result
 
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
+from sdc_taichi.exogenous import load_site, read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.columns import column_map
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
@@ -112,6 +114,54 @@ def test_carbon_and_workload_in_other_units(tmp_path: Path, user_folder: Path) -
     assert "IT power [kW] read as cpu_load, in kW,120..800" in done.output
     stored = read_workload(user_folder / "traces" / "hall.parquet")
     np.testing.assert_allclose(stored.values, load, rtol=1e-8)
+
+
+@pytest.mark.parametrize("end", ["\r", "\r\n", "\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_any_line_end_is_read(end: str, mark: str, tmp_path: Path, user_folder: Path) -> None:
+    lines = build.carbon_lines()
+    lines[0] = mark + lines[0].replace("avg_CI", '"rate, g/kWh"')
+    table = tmp_path / "table.csv"
+    table.write_bytes(end.join(lines).encode())
+    columns = maps("avg_CI=rate, g/kWh")
+    result = run(str(table), "--site=here", "--base=NY", *columns)
+    assert result.exit_code == 0, result.output
+    plain = tmp_path / "plain.csv"
+    plain.write_text(build.text(build.carbon_lines()))
+    stored = load_site("here").ci_g_per_kwh.values
+    np.testing.assert_array_equal(stored, read_carbon(plain, -5.0).values)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_columns_of_one_name_are_refused(suffix: str, tmp_path: Path) -> None:
+    rows = [line.split(",") for line in build.workload_lines()[1:]]
+    path = tmp_path / f"load{suffix}"
+
+    def write(*header: str) -> None:
+        cells = [[*row, row[-1]][: len(header)] for row in rows]
+        if suffix == ".csv":
+            path.write_text(build.text([",".join(row) for row in ([*header], *cells)]))
+        else:
+            arrays = [pa.array(column) for column in zip(*cells, strict=True)]
+            pq.write_table(pa.Table.from_arrays(arrays, list(header)), path)
+
+    write("", "cpu_load", "cpu_load")
+    twice = r"row 1: columns 2 and 3 are both named 'cpu_load', expected each name once"
+    with pytest.raises(DataError, match=twice):
+        read_workload(path)
+    write("", "load", "load")
+    with pytest.raises(DataError, match="columns 2 and 3 are both named 'load'"):
+        read_workload(path, columns={"cpu_load": "load"})
+    write("flag", "load", "flag")
+    with pytest.raises(DataError, match="columns 1 and 3 are both named 'flag'"):
+        read_workload(path)
+
+
+def test_other_columns_may_share_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "load.csv"
+    rows = [f"{line},ok,ok" for line in build.workload_lines()[1:]]
+    path.write_text(build.text([",load,state,state", *rows]))
+    assert read_workload(path, columns={"cpu_load": "load"}).values.size == 8760
 
 
 def test_errors_are_in_the_unit_of_the_file(tmp_path: Path) -> None:

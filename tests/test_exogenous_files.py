@@ -18,9 +18,11 @@ from sdc_taichi.exogenous import (
     statistics,
     wet_bulb_c,
 )
+from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.exogenous.stamps import Stamp
+from sdc_taichi.exogenous.weather import read_city, read_elevation_m
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
 
@@ -388,6 +390,14 @@ def test_a_row_of_negative_generation_alone_is_interpolated(tmp_path: Path) -> N
     lines[500] = lines[500].split(",")[0] + ",0,0,0,0,-316,0,0,0,490"
     series = read_carbon(write(tmp_path / "ci.csv", lines), 0.0, "start")
     assert series.values[499] == pytest.approx(np.mean(series.values[[498, 500]]))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_the_header_of_weather_is_read_with_any_line_end(end: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "x.epw", build.epw_lines(), end)
+    assert (read_city(path), read_elevation_m(path)) == ("Test.Station", 10.0)
+    assert file_kind(path) == "weather"
+    assert read_epw(path).elevation_m == 10.0
 
 
 def test_a_pressure_that_does_not_fit_the_elevation_is_told(tmp_path: Path) -> None:

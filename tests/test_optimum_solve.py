@@ -212,6 +212,30 @@ def test_the_text_of_an_objective_says_its_weights_exactly(weight: float) -> Non
     assert Objective.parse(str(objective)) == objective
 
 
+@pytest.mark.parametrize("weight", [1e-90, 1e-12, 1e20, 1e90])
+def test_the_size_of_weights_does_not_matter(weight: float) -> None:
+    """The tolerances of the solver are absolute."""
+    one, scaled = (
+        solved(config_of("CA"), steps=24, objective=Objective(energy=size, water=size))
+        for size in (1.0, weight)
+    )
+    for name in ("idle", "bound", "achieved"):
+        np.testing.assert_allclose(getattr(scaled, name) / weight, getattr(one, name), rtol=1e-6)
+
+
+def test_terms_of_very_different_weights_are_solved() -> None:
+    water = solved(config_of("CA"), steps=24, objective=Objective(water=1e90))
+    both = solved(config_of("CA"), steps=24, objective=Objective(carbon=1.0, water=1e90))
+    np.testing.assert_allclose(both.bound, water.bound, rtol=1e-6)
+
+
+@pytest.mark.parametrize("weight", ["1e300", "1e-300", "1e400"])
+def test_weights_that_overflow_are_refused(weight: str) -> None:
+    valid = r"valid is 0, or 1e-100 to 1e\+100|is no number"
+    with pytest.raises(ConfigError, match=rf"^objective.* weight .*({valid})$"):
+        Objective.parse(f"carbon+{weight}*water")
+
+
 def test_what_is_kept_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     first = solved(config_of("CA"), steps=24, cache="kept")

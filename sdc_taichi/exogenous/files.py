@@ -6,10 +6,12 @@ a Parquet file count from 1 without headers.)
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, shortened
-from sdc_taichi.exogenous.columns import Unit
+from sdc_taichi.exogenous.columns import COLUMN_NAMES, Unit
 from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.stamps import HAS_OFFSET
 from sdc_taichi.exogenous.year_clock import (
@@ -43,6 +45,8 @@ MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in lower case, that represent a missing number."""
 NO_UNIT = Unit("")
 """Placeholder for the unit that the reader expects."""
+_HEADER_BYTES = 1 << 16
+"""Largest size of the header of a CSV file, in bytes."""
 _FIRST_BYTES = 4096
 
 
@@ -195,18 +199,24 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
         columns: column names in the file, by their new names.
 
     Raises:
-        DataError: the file is no readable table, has no rows, or lacks one of ``columns``.
+        DataError: the file is no readable table, has no rows, lacks one of ``columns``, or has
+            several columns of a name that may be read. With ``columns`` these are the named ones
+            and ``COLUMN_NAMES``, otherwise all.
     """
     import pandas as pd
 
+    may_be_read = {*columns.values(), *COLUMN_NAMES} if columns else None
     if is_parquet(path):
-        frame = read_arrow(path).to_pandas()
+        arrow = read_arrow(path)
+        _refuse_repeated(path, arrow.column_names, may_be_read)
+        frame = arrow.to_pandas()
         if not isinstance(frame.index, pd.RangeIndex):
             frame = frame.reset_index()
         first_row = 1
         frame = frame.astype(object).where(frame.notna(), "").astype(str)
     else:
-        frame = _read_csv(path)
+        header, frame = _read_csv(path)
+        _refuse_repeated(path, header, may_be_read)
         first_row = 2
     while len(frame) and not "".join(str(x) for x in frame.iloc[-1]).strip():
         frame = frame.iloc[:-1]
@@ -228,8 +238,19 @@ def read_table(path: Path, columns: Mapping[str, str] = MappingProxyType({})) ->
     return Table(path, frame[sorted(frame.columns, key=lambda name: name != "timestamp")])
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
-    """Read a CSV file with all columns as text."""
+def _refuse_repeated(path: Path, header: Sequence[str], may_be_read: Set[str] | None) -> None:
+    for at, name in enumerate(header):
+        other = header.index(name)
+        is_read = name.strip() not in BLANK_HEADERS and (may_be_read is None or name in may_be_read)
+        if other < at and is_read:
+            raise DataError(
+                f"{path}: row 1: columns {other + 1} and {at + 1} are both named "
+                f"{shortened(name)}, expected each name once"
+            )
+
+
+def _read_csv(path: Path) -> tuple[list[str], pd.DataFrame]:
+    """Read the header of a CSV file, and all of its columns as text."""
     import pandas as pd
 
     with (
@@ -242,21 +263,37 @@ def _read_csv(path: Path) -> pd.DataFrame:
         file.seek(0)
         # Rows with a wrong number of cells cause an error later, about the missing values.
         warnings.simplefilter("ignore", pd.errors.ParserWarning)
+        options: dict[str, Any] = {
+            "dtype": str,
+            "keep_default_na": False,
+            "skip_blank_lines": False,
+            "encoding": "utf-8-sig",
+            "index_col": False,
+            "on_bad_lines": "error",
+        }
         try:
-            frame = pd.read_csv(
-                file,
-                dtype=str,
-                keep_default_na=False,
-                skip_blank_lines=False,
-                encoding="utf-8-sig",
-                index_col=False,
-                on_bad_lines="error",
-            )
+            header = pd.read_csv(file, header=None, nrows=1, **options).iloc[0].tolist()
+            file.seek(0)
+            frame = pd.read_csv(file, **options)
         except pd.errors.EmptyDataError:
             raise DataError(f"{path}: empty, expected a header and rows") from None
         except UnicodeDecodeError as error:
             raise DataError(f"{path}: byte {error.start}: not UTF-8 text") from None
-    return frame.fillna("")
+    return [str(name) for name in header], frame.fillna("")
+
+
+def csv_header(path: Path) -> list[str]:
+    """Return the names of the columns of a CSV file with any kind of line ends.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    with (
+        open_input(path, MOST_TABLE_BYTES, DataError) as file,
+        decoding(path, "a CSV table", DataError),
+    ):
+        text = file.read(_HEADER_BYTES).decode("utf-8-sig", errors="replace")
+        return next(csv.reader(io.StringIO(text, newline=None)), [])
 
 
 def read_arrow(path: Path) -> pa.Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ from sdc_taichi.exogenous.synthetic import (
 from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 from sdc_taichi.exogenous.workload import read_workload
-from sdc_taichi.user_file import MOST_TABLE_BYTES, list_folder, open_input
+from sdc_taichi.user_file import list_folder
 
 KINDS = ("weather", "carbon", "workload")
 """Kinds of files, in the order in which a folder is imported."""
@@ -73,15 +72,14 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
             return str(metadata["kind"])
         header = set(series_file.column_names(path))
     else:
-        with open_input(path, MOST_TABLE_BYTES, DataError) as handle:
-            line = handle.readline(4096).decode("utf-8", errors="replace").lstrip("\ufeff").strip()
-        if line.upper().startswith("LOCATION,"):
+        names = files.csv_header(path)
+        if names and names[0].strip().upper() == "LOCATION":
             return "weather"
-        header = {cell.strip() for cell in next(csv.reader([line]), [])}
+        header = {name.strip() for name in names}
     kinds = {"avg_CI": "carbon", "cpu_load": "workload", "dry_bulb": "weather table"}
-    names = column_map(columns).names
-    for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in names):
-        if names.get(column, column) in header:
+    mapped = column_map(columns).names
+    for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in mapped):
+        if mapped.get(column, column) in header:
             return kind
     hint = files.mapping_hint(header) or (
         " or --map avg_CI=COLUMN, --map cpu_load=COLUMN, --map dry_bulb=COLUMN"

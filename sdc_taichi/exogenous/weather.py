@@ -236,7 +236,7 @@ def read_elevation_m(path: str | Path) -> float:
 
 def _first_line(path: Path) -> str:
     with open_input(path, MOST_TABLE_BYTES, DataError) as file:
-        return _decoded(file.readline(_LONGEST_LINE))
+        return (_decoded(file.read(_LONGEST_LINE)).splitlines() or [""])[0]
 
 
 def _decoded(content: bytes) -> str:

@@ -16,6 +16,8 @@ from sdc_taichi.types import F64, StepResult
 
 _UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
 """Units of the objectives that consist of a single term with weight 1."""
+WEIGHT_LIMITS = (1e-100, 1e100)
+"""Limits of weights above 0, within which figures neither overflow nor lose digits."""
 _TERM = re.compile(r"(?:(?P<weight>[^*]+)\*)?(?P<name>[^*]+)")
 
 
@@ -27,7 +29,7 @@ class Objective:
     the energy bought in kWh, the electricity bill, and the make-up water in litres.
 
     Raises:
-        ConfigError: a weight is negative or not finite, or no weight is above 0.
+        ConfigError: a weight is neither 0 nor within 1e-100..1e100, or no weight is above 0.
     """
 
     carbon: float = 0.0
@@ -43,8 +45,11 @@ class Objective:
         """Check the weights."""
         weights = {f.name: getattr(self, f.name) for f in fields(self)}
         for name, weight in weights.items():
-            if not 0.0 <= weight < np.inf:
-                raise ConfigError(f"objective: weight {weight:g} of {name}; valid is 0 or more")
+            low, high = WEIGHT_LIMITS
+            if weight != 0.0 and not low <= weight <= high:
+                raise ConfigError(
+                    f"objective: weight {weight:g} of {name}; valid is 0, or {low:g} to {high:g}"
+                )
         if not any(weights.values()):
             raise ConfigError(f"objective: no weight is above 0; valid terms: {', '.join(weights)}")
 

@@ -18,6 +18,7 @@ blocks and rows in the order in which they were added.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -51,6 +52,10 @@ a lower bound.
 """
 _INFEASIBLE = 2
 """Status that ``scipy.optimize.linprog`` returns for an infeasible problem."""
+
+_COST_LIMITS = (0.01, 1e12)
+"""Limits of the largest cost coefficient that the solver receives. Its tolerances are absolute, and
+it takes costs of 1e20 for infinite, so others are scaled."""
 
 
 class InfeasibleError(Exception):
@@ -236,9 +241,11 @@ class Programme:
         if np.any(bounds[:, 0] > bounds[:, 1]):
             raise InfeasibleError
         largest = 0.0 if upper_right is None else max(1.0, float(np.abs(upper_right).max()))
+        cost = np.concatenate(list(self._cost.values()))
+        scale = _scale(cost)
         for relief, (method, options) in product(_RELIEFS, _ATTEMPTS):
             result = linprog(
-                np.concatenate(list(self._cost.values())),
+                cost * scale,
                 A_ub=upper,
                 b_ub=None if upper_right is None else upper_right + relief * largest,
                 A_eq=equal,
@@ -255,9 +262,10 @@ class Programme:
             raise RuntimeError(f"linear programme: {result.message}")
         rows = [{n: len(row) for n, row in block.items()} for block in (self._at_most, self._equal)]
         return Solution(
-            float(result.fun),
+            float(result.fun) / scale,
             _split(result.x, self._sizes),
-            _split(result.ineqlin.marginals, rows[0]) | _split(result.eqlin.marginals, rows[1]),
+            _split(result.ineqlin.marginals / scale, rows[0])
+            | _split(result.eqlin.marginals / scale, rows[1]),
         )
 
     def _matrix(self, rows: Mapping[str, Linear]) -> tuple[Matrix | None, F64 | None]:
@@ -275,6 +283,15 @@ class Programme:
         ]
         right = np.concatenate([-row.constant for row in rows.values()])
         return sparse.block_array(blocks, format="csc"), right
+
+
+def _scale(cost: F64) -> float:
+    """Return the factor, a power of two, by which the solver receives costs, (n,)."""
+    largest = float(np.abs(cost).max())
+    low, high = _COST_LIMITS
+    if largest == 0.0 or low <= largest <= high:
+        return 1.0
+    return math.ldexp(1.0, -math.frexp(largest)[1])
 
 
 def _linear(value: Linear | F64 | float) -> Linear:
