@@ -344,7 +344,9 @@ class _Defer:
         return Actions(load=-1.0)
 
 
-@pytest.mark.parametrize(("model", "dropped_and_not_run"), [("fluid", 1.0), ("tasks", 0.0)])
+@pytest.mark.parametrize(
+    ("model", "dropped_and_not_run"), [("fluid", 1.0), ("tasks", 1.0), ("released", 0.0)]
+)
 def test_work_of_a_run_adds_up_with_a_full_queue(model: str, dropped_and_not_run: float) -> None:
     values = [f"workload.model={model}", "workload.queue_limit_h=1"]
     with Simulator(load_config("tiny", values)) as sim:

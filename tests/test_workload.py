@@ -101,18 +101,24 @@ def expected_step(
         flexible = math.floor(demand * limits.flexible_share * 100.0)
         arrived = fixed + flexible
         due = line.waited(limits.deadline_steps + 1.0, now)
-        forced = min(due, max(capacity - arrived, 0.0))
-        held_back = math.floor(defer * flexible)
+        for_queued = min(capacity, 90.0) - arrived if model == "released" else capacity
+        forced = min(due, max(for_queued, 0.0))
+        at_once = min(arrived - math.floor(defer * flexible), capacity - forced)
+        held_back = arrived - at_once
     line.take(forced)
     deferred = min(held_back, limits.queue_limit - line.length)
     dropped = held_back - deferred
     if model == "fluid":
         drained = min(line.length, drain * (capacity - at_once - forced))
-        executed = at_once + forced + drained
-    else:
-        free = max(capacity - arrived - forced, 0.0)
+    elif model == "tasks":
+        free = capacity - at_once - forced
         drained = math.floor(drain * min(line.length, flexible, free))
-        executed = arrived - deferred + forced + drained
+    else:
+        # Tasks for which the queue has no room run after all, within the limit.
+        at_once = min(arrived - deferred, capacity - forced)
+        free = max(min(capacity, 90.0) - at_once - forced, 0.0)
+        drained = math.floor(drain * min(line.length, flexible, free))
+    executed = at_once + forced + drained
     line.take(drained)
     if deferred > 0:
         line.batches.append(Batch(now, deferred))
@@ -150,12 +156,12 @@ def test_every_step_equals_a_line_of_batches(
     model: str, steps: list[tuple[float, float]], limits: Limits
 ) -> None:
     queue, line = np.zeros((1, LENGTH)), Line()
-    for now, (demand, command) in enumerate(whole(steps) if model == "tasks" else steps):
+    for now, (demand, command) in enumerate(steps if model == "fluid" else whole(steps)):
         work = one_step(model, queue, demand, command, limits)
         queue = work.queue
         expected = expected_step(model, line, now, demand, command, limits)
         for name, value in expected.items():
-            tolerance = 0.0 if model == "tasks" and name not in ("mean_age_steps",) else 1e-8
+            tolerance = 0.0 if model != "fluid" and name not in ("mean_age_steps",) else 1e-8
             if name == "oldest_age_steps" and model == "fluid":
                 continue  # what rounding leaves of a batch is compared below
             found = float(getattr(work, name)[0])
@@ -204,24 +210,33 @@ def test_fluid_work_is_conserved_and_within_its_limits(
     assert arrived == pytest.approx(executed + queue[0, -1] + dropped, abs=1e-9)
 
 
+@pytest.mark.parametrize("model", ["tasks", "released"])
 @settings(max_examples=60)
 @given(steps=STEPS, limits=LIMITS)
-def test_whole_tasks_stay_whole_and_are_conserved(
-    steps: list[tuple[float, float]], limits: Limits
+def test_whole_tasks_stay_whole_within_their_limits_and_are_conserved(
+    model: str, steps: list[tuple[float, float]], limits: Limits
 ) -> None:
     queue = np.zeros((1, LENGTH))
+    cap = math.floor(limits.max_utilisation * 100.0)
     for demand, command in steps:
         before = queue[0, -1]
-        work = one_step("tasks", queue, demand, command, limits)
+        work = one_step(model, queue, demand, command, limits)
         queue = work.queue
         for name, values in vars(work).items():
             if name not in ("utilisation", "mean_age_steps"):
                 assert np.array_equal(values, np.rint(values)), name
-        # Tasks that find the queue full count as dropped and run all the same.
-        assert work.arrived_tasks[0] == work.started_tasks[0] + queue[0, -1] - before
-        assert abs(work.arrived_tasks[0] - 100.0 * demand) < 1.0 + 1e-9
-        cap = math.floor(limits.max_utilisation * 100.0)
-        assert work.started_tasks[0] <= max(cap, work.arrived_tasks[0])
+        arrived, started = work.arrived_tasks[0], work.started_tasks[0]
+        not_run = arrived - (started + queue[0, -1] - before)
+        if model == "tasks":
+            assert not_run == work.dropped_tasks[0]
+            if work.overdue_tasks[0] > 0:
+                assert started == cap, "overdue with capacity to spare"
+        else:
+            # Tasks that find the queue full count as dropped, and run if the limit allows.
+            assert not_run <= work.dropped_tasks[0]
+            assert not_run == 0 or started == cap
+        assert abs(arrived - 100.0 * demand) < 1.0 + 1e-9
+        assert started <= cap
         assert queue[0, -1] <= limits.queue_limit
 
 
@@ -249,7 +264,7 @@ def test_full_queue_drops(model: str) -> None:
         dropped.append(float(work.dropped_tasks[0]))
     assert dropped == [0, 0, 0, 40, 40, 40]
     assert queue[0, -1] == 120
-    assert work.started_tasks[0] == (80 if model == "tasks" else 40)
+    assert work.started_tasks[0] == (80 if model == "released" else 40)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -290,3 +305,23 @@ def test_a_queue_that_rounding_overfills_takes_nothing(model: str) -> None:
         queue_limit=limit,
     )
     assert work.deferred_tasks == 0.0
+
+
+@pytest.mark.parametrize("preset", ["tiny", "sustaindc"])
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("limit", [0.05, 0.29, 0.6])
+def test_no_run_exceeds_its_highest_utilisation(preset: str, model: str, limit: float) -> None:
+    values = [f"workload.model={model}", f"workload.max_utilisation={limit}"]
+    rng = np.random.default_rng(1)
+    arrived = executed = dropped = 0.0
+    with Simulator(load_config(preset, values)) as sim:
+        sim.reset()
+        for _ in range(130):
+            step = sim.step(Actions(load=rng.uniform(-1.0, 1.0, 1)))
+            assert step.utilisation[0] <= limit + 1e-12
+            arrived += step.arrived_tasks[0]
+            executed += step.executed_tasks[0]
+            dropped += step.dropped_tasks[0]
+    if model != "released":
+        assert arrived == pytest.approx(executed + dropped + step.queue_tasks[0])
+    assert executed > 0.8 * 100.0 * limit * 130 if limit < 0.3 else executed > 0

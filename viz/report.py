@@ -214,7 +214,7 @@ def _work_texts(run: RunFolder) -> list[str]:
     (config,) = read_configs(run, [0])
     dropped = (
         f"{text['dropped_tasks']} of them at once because the queue was full ({dropped_pct:.3g} %),"
-        if config.workload.model == "tasks"
+        if config.workload.model == "released"
         else f"{text['dropped_tasks']} dropped ({dropped_pct:.3g} %)"
     )
     texts = [

@@ -91,7 +91,8 @@ class WorkloadConfig(Section):
     """Delay-tolerant work: its share, queue and deadline (1 task = 1 % of capacity for a step)."""
 
     model: Annotated[str, NameIn(WORK_MODELS)] = "fluid"
-    """Work model: a continuous quantity, or whole tasks as in the released SustainDC."""
+    """Work model: a continuous quantity, whole tasks, or whole tasks as the released SustainDC
+    counts them."""
     trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"

@@ -259,12 +259,15 @@ class QueuePlanner:
         flexible = arrived * self._share
         capacity = np.broadcast_to(self._cap * TASKS_PER_STEP, demand.shape)
         most_drained, most_due = np.full(demand.shape, UNLIMITED_TASKS), capacity
-        if self._model == "tasks":
-            # The model ``tasks`` moves whole tasks, and runs inflexible work beyond the capacity.
-            flexible = np.floor(flexible)
-            arrived = np.ceil(arrived * (1.0 - self._share)) + flexible
-            capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
-            most_due = capacity - arrived
+        if self._model != "fluid":
+            arrived, flexible = workload.arriving_tasks(demand, self._share)
+            capacity, most_drained = np.floor(capacity), flexible
+            most_due = capacity
+        if self._model == "released":
+            # Arriving work runs first, and beyond the limit of queued work.
+            now = np.minimum(arrived, capacity)
+            capacity = np.maximum(np.minimum(capacity, workload.RELEASED_QUEUE_TASKS), now)
+            most_due = capacity - now
         held_back = np.maximum(flexible, arrived - capacity)
         lead, depression = self._facility.places_of_weather(weather.outdoor_c, weather.wet_bulb_c)
         most_waiting = (waiting[:, None] - due) + self._not_due(held_back)

@@ -170,9 +170,9 @@ class DispatchProgramme:
         p.equal("drain", entered[drain], 0.0)
         p.at_most("drained", 0.0, left[drain])
         p.at_most("run", 0.0, left[due])
-        if self._problem.work.model == "tasks":
-            # In model ``tasks``, a queue without due work falls by at most the flexible work of the
-            # step, and a step with due work takes back no deferred work.
+        if self._problem.work.model != "fluid":
+            # In models of whole tasks, a queue without due work falls by at most the flexible work
+            # of the step, and a step with due work takes back no deferred work.
             most = self._problem.work.most_deferred_tasks[self._steps]
             fall, others = self._queue.before(self._start_tasks) - self._queue, modes != DUE
             p.at_most("drain_limit", fall[others], most[others])

@@ -16,7 +16,13 @@ from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.plant.battery import BatteryParameters
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
-from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS, WorkPoint
+from sdc_taichi.plant.workload import (
+    RELEASED_QUEUE_TASKS,
+    TASKS_PER_STEP,
+    UNLIMITED_TASKS,
+    WorkPoint,
+    arriving_tasks,
+)
 from sdc_taichi.sim.bills import month_around
 from sdc_taichi.sim.crac_units import schedules_c
 from sdc_taichi.sim.drivers import Drivers
@@ -56,7 +62,7 @@ class FlexibleWork:
     deadline_steps: int | None
     """Number of steps after which deferred work must be executed; None means no deadline."""
     model: str
-    """Name of the workload model: ``fluid`` or ``tasks``."""
+    """Name of the workload model, see ``plant.workload``."""
     most_dropped_tasks: float = 0.0
     """Maximum work that may be dropped in all scored steps, in tasks; equal to the work dropped
     under idle commands."""
@@ -275,11 +281,16 @@ def _work(fleet: Fleet, demand: F64, scored_from: int) -> list[FlexibleWork]:
         cap = config.workload.max_utilisation * TASKS_PER_STEP
         arrived = arrived_tasks(model, demand[i], share)
         deadline = None if np.isinf(due[i]) else int(due[i])
-        if model == "tasks":
-            most_deferred = np.floor(demand[i] * share * TASKS_PER_STEP)
-            most_executed = np.maximum(arrived, np.floor(cap))
+        flexible = share * arrived
+        if model != "fluid":
+            cap = float(np.floor(cap))
+            flexible = arriving_tasks(demand[i], share)[1]
+        if model == "released":
+            # Due work takes no capacity from arriving work.
+            most_deferred = np.maximum(flexible, arrived - cap)
+            most_executed = np.maximum(np.minimum(arrived, cap), min(cap, RELEASED_QUEUE_TASKS))
         else:
-            most_deferred = _most_deferred_fluid(arrived, share, cap, deadline)
+            most_deferred = _most_deferred(arrived, flexible, cap, deadline)
             most_executed = np.full(len(arrived), cap)
         works.append(
             FlexibleWork(
@@ -332,8 +343,8 @@ def _under_idle_commands(fleet: Fleet, demand: F64) -> tuple[F64, F64]:
     return done, dropped
 
 
-def _most_deferred_fluid(arrived: F64, share: float, cap: float, deadline: int | None) -> F64:
-    """Return the maximum arriving work that can wait in model ``fluid``, in tasks, (T,).
+def _most_deferred(arrived: F64, flexible: F64, cap: float, deadline: int | None) -> F64:
+    """Return the maximum arriving work that can wait if due work runs first, in tasks, (T,).
 
     The flexible share may wait by choice. In addition, arriving work must wait if due work leaves
     no capacity for it. Due work is at most the work deferred one deadline earlier, provided that
@@ -342,11 +353,11 @@ def _most_deferred_fluid(arrived: F64, share: float, cap: float, deadline: int |
 
     Args:
         arrived: Arriving work, in tasks, (T,).
-        share: Flexible share of the arriving work, 0..1.
+        flexible: Arriving work that may wait by choice, in tasks, (T,).
         cap: Maximum work of a step, in tasks.
         deadline: Deadline in steps; None means no deadline.
     """
-    most = share * arrived
+    most = flexible.copy()
     if np.any(arrived > cap):
         return arrived.copy()
     if deadline is None:

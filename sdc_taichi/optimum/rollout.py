@@ -17,7 +17,7 @@ from sdc_taichi.optimum.tables import (
 )
 from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
 from sdc_taichi.plant.cooling import avoid_repeats
-from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.plant.workload import RELEASED_QUEUE_TASKS, TASKS_PER_STEP, arriving_tasks
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
@@ -235,12 +235,12 @@ def load_command(
 
     The function inverts the workload models of ``plant.workload``. If the amount is impossible, the
     command comes as close as it can. Due work is always executed. Deferred work never exceeds the
-    room in the queue, so following a plan drops no work. Model ``tasks`` executes the nearest whole
-    number of tasks.
+    room in the queue, so following a plan drops no work. Models of whole tasks execute the
+    nearest whole number.
 
     Args:
         executed_tasks: work to execute, in tasks, (B,).
-        model: name of the workload model, ``fluid`` or ``tasks``.
+        model: name of the workload model.
         demand: work that arrives, as a share of capacity, 0..1, (B,).
         waiting_tasks: work in the queue, in tasks, (B,).
         due_tasks: work in the queue whose deadline has come, in tasks, (B,).
@@ -248,16 +248,11 @@ def load_command(
         max_utilisation: highest utilisation, 0..1, (B,).
         queue_limit_tasks: longest queue, in tasks, (B,).
     """
-    of_model = _tasks_command if model == "tasks" else _fluid_command
-    return of_model(
-        executed_tasks,
-        demand,
-        waiting_tasks,
-        due_tasks,
-        flexible_share,
-        max_utilisation,
-        queue_limit_tasks,
-    )
+    values = (executed_tasks, demand, waiting_tasks, due_tasks)
+    limits = (flexible_share, max_utilisation, queue_limit_tasks)
+    if model == "fluid":
+        return _fluid_command(*values, *limits)
+    return _whole_command(*values, *limits, is_released=model == "released")
 
 
 def _fluid_command(
@@ -276,20 +271,31 @@ def _fluid_command(
     return np.where(executed >= neutral, drain, -defer)
 
 
-def _tasks_command(
-    executed: F64, demand: F64, waiting: F64, due: F64, flexible_share: F64, cap: F64, limit: F64
+def _whole_command(
+    executed: F64,
+    demand: F64,
+    waiting: F64,
+    due: F64,
+    flexible_share: F64,
+    cap: F64,
+    limit: F64,
+    *,
+    is_released: bool,
 ) -> F64:
-    """Return the load command for workload model ``tasks``, (B,); see ``load_command``."""
-    flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
-    arrived = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP) + flexible
-    capacity = np.floor(cap * TASKS_PER_STEP)
-    forced = np.minimum(due, np.maximum(capacity - arrived, 0.0))
+    """Return the load command for the models of whole tasks, (B,); see ``load_command``."""
+    arrived, flexible = arriving_tasks(demand, flexible_share)
+    capacity = most_queued = np.floor(cap * TASKS_PER_STEP)
+    forced = np.minimum(due, capacity)
+    if is_released:
+        most_queued = np.minimum(capacity, RELEASED_QUEUE_TASKS)
+        forced = np.minimum(due, np.maximum(most_queued - arrived, 0.0))
     room = np.maximum(limit - (waiting - forced), 0.0)
-    more = np.rint(executed - arrived - forced)
-    free = np.maximum(capacity - arrived - forced, 0.0)
+    now = np.minimum(arrived, capacity - forced)
+    more = np.rint(executed - now - forced)
+    free = np.maximum(most_queued - now - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
-    held_back = np.minimum(np.minimum(-more, flexible), np.floor(room))
-    # The workload model rounds down, so half a task is added to obtain exactly the whole number.
+    held_back = np.minimum(np.minimum(arrived - now - more, flexible), np.floor(room))
+    # The workload models round down, so half a task is added to obtain exactly the whole number.
     drain = np.where(more > 0, _share(more + 0.5, drainable), 0.0)
     defer = np.where(held_back > 0, _share(held_back + 0.5, flexible), 0.0)
     return np.where(more >= 0, drain, -defer)

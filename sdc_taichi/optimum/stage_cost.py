@@ -172,14 +172,14 @@ def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
 def work_limits(problem: Problem) -> tuple[F64, F64]:
     """Return the minimum and the maximum work that each step can execute, in tasks, (T,) each.
 
-    Arriving work that may not be deferred is executed at once. In workload model ``tasks``, a step
+    Arriving work that may not be deferred is executed at once. In models of whole tasks, a step
     drains at most its own amount of flexible work from the queue, in addition to due work. Due work
     is at most the work deferred one deadline earlier.
     """
     work = problem.work
     least = work.arrived_tasks - work.most_deferred_tasks
     most = np.maximum(work.most_executed_tasks, least)
-    if work.model == "tasks":
+    if work.model != "fluid":
         beyond = work.most_deferred_tasks.copy()
         if work.deadline_steps is not None:
             due = work.most_deferred_tasks[: -work.deadline_steps or None]

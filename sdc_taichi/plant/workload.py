@@ -20,6 +20,8 @@ from sdc_taichi.types import F64, Values, Work
 
 TASKS_PER_STEP = 100.0
 """Capacity of a data center in one step, in tasks."""
+RELEASED_QUEUE_TASKS = 90.0
+"""Work of a step up to which the released SustainDC starts queued work, in tasks."""
 
 
 class WorkPoint(NamedTuple):
@@ -37,7 +39,7 @@ class WorkPoint(NamedTuple):
     flexible_share: Values
     """Share of the demand that may wait, 0..1, (B,)."""
     max_utilisation: Values
-    """Highest utilisation, 0..1, (B,); the model ``tasks`` applies it to queued work only."""
+    """Highest utilisation, 0..1, (B,)."""
     queue_limit: Values
     """Longest queue, in tasks, (B,)."""
 
@@ -76,26 +78,63 @@ def fluid(point: WorkPoint) -> Work:
 
 
 def tasks(point: WorkPoint) -> Work:
-    """Step whole tasks as the released SustainDC counts them: arrived = executed + queued.
+    """Step whole tasks, with arrived = executed + queued + dropped.
 
     Fixed work is rounded up and flexible work down, so a step may execute one task more than
-    arrived. Overdue tasks run first, up to the utilisation cap. A drain runs at most as many queued
-    tasks as flexible tasks arrived in the step, and stops at the cap. As in the released code,
-    arriving work that is not deferred runs even above the cap. Tasks for which the queue has no
-    room also run; they count both as dropped and as started.
+    arrived. The rules are those of ``fluid``, with one exception: a drain runs at most as many
+    queued tasks as flexible tasks arrived in the step, as in the released SustainDC.
     """
-    fixed = np.ceil(point.demand * (1.0 - point.flexible_share) * TASKS_PER_STEP)
-    flexible = np.floor(point.demand * point.flexible_share * TASKS_PER_STEP)
-    cap = np.floor(point.max_utilisation * TASKS_PER_STEP)
-    arrived = fixed + flexible
-    forced = np.minimum(point.due, np.maximum(cap - arrived, 0.0))
-    held_back = np.floor(np.maximum(-point.command, 0.0) * flexible)
-    deferred = np.minimum(held_back, _room(point.queue_limit, point.waiting - forced))
-    free = np.maximum(cap - arrived - forced, 0.0)
-    drainable = np.minimum(np.minimum(point.waiting - forced, flexible), free)
-    drained = np.floor(np.maximum(point.command, 0.0) * drainable)
-    started = arrived - deferred + forced + drained
+    arrived, flexible = arriving_tasks(point.demand, point.flexible_share)
+    capacity = np.floor(point.max_utilisation * TASKS_PER_STEP)
+    forced = np.minimum(point.due, capacity)
+    now = np.minimum(arrived - _deferred_by_command(point, flexible), capacity - forced)
+    held_back = arrived - now
+    deferred = np.minimum(held_back, np.floor(_room(point.queue_limit, point.waiting - forced)))
+    drained = _drained(point, flexible, forced, capacity - now - forced)
+    started = now + forced + drained
     return _work(point, arrived, started, forced, deferred, held_back - deferred, drained)
+
+
+def released(point: WorkPoint) -> Work:
+    """Step whole tasks as the released SustainDC counts them: arrived = executed + queued.
+
+    In contrast to ``tasks``, arriving work runs before due work, and queued work runs only up to
+    ``RELEASED_QUEUE_TASKS``. Tasks that a command holds back and for which the queue has no room
+    run too; they count both as dropped and as started. ``max_utilisation``, 1 in the released
+    code, limits all work: arriving tasks above it are queued, and dropped if the queue is full.
+    """
+    arrived, flexible = arriving_tasks(point.demand, point.flexible_share)
+    capacity = np.floor(point.max_utilisation * TASKS_PER_STEP)
+    most_queued = np.minimum(capacity, RELEASED_QUEUE_TASKS)
+    forced = np.minimum(point.due, np.maximum(most_queued - arrived, 0.0))
+    wanted = np.minimum(arrived - _deferred_by_command(point, flexible), capacity - forced)
+    held_back = arrived - wanted
+    deferred = np.minimum(held_back, np.floor(_room(point.queue_limit, point.waiting - forced)))
+    now = np.minimum(arrived - deferred, capacity - forced)
+    free = np.maximum(most_queued - now - forced, 0.0)
+    drained = _drained(point, flexible, forced, free)
+    started = now + forced + drained
+    return _work(point, arrived, started, forced, deferred, held_back - deferred, drained)
+
+
+def arriving_tasks(demand: Values, flexible_share: Values) -> tuple[F64, F64]:
+    """Return all work and the flexible work that arrive in a step, in whole tasks, (B,) each."""
+    fixed = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP)
+    flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
+    return fixed + flexible, flexible
+
+
+def _deferred_by_command(point: WorkPoint, flexible: F64) -> F64:
+    """Return the flexible tasks that a negative command holds back, (B,)."""
+    deferred: F64 = np.floor(np.maximum(-point.command, 0.0) * flexible)
+    return deferred
+
+
+def _drained(point: WorkPoint, flexible: F64, forced: F64, free: F64) -> F64:
+    """Return the queued tasks that a positive command runs within the free capacity, (B,)."""
+    drainable = np.minimum(np.minimum(point.waiting - forced, flexible), free)
+    drained: F64 = np.floor(np.maximum(point.command, 0.0) * drainable)
+    return drained
 
 
 def _work(
@@ -133,6 +172,7 @@ def _room(queue_limit: Values, waiting: F64) -> F64:
 MODELS: dict[str, WorkModel] = {
     "fluid": WorkModel(fluid, due_after_steps=0.0),
     "tasks": WorkModel(tasks, due_after_steps=1.0),
+    "released": WorkModel(released, due_after_steps=1.0),
 }
 """Work models by their names, the valid values of ``workload.model``."""
 NEGLIGIBLE_TASKS = 1e-9
