@@ -13,6 +13,11 @@ from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.types import F64
 
 _MOST_HEIGHT_ITERATIONS = 100
+EXACT_RACKS = 10_000
+"""Largest number of racks of a hall whose design point is iterated to the last digits; an iteration
+takes up to a second in a hall of 100,000 racks."""
+_EXACT_FACTOR, _LARGE_FACTOR = 1e-15, 1e-7
+"""Tolerances of height factors of halls of up to EXACT_RACKS, and of larger halls."""
 
 
 MOST_RISE_K = 40.0
@@ -176,13 +181,14 @@ def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F
     """
     supply_c, group_approach_k = config.hall.design_supply_c, servers.per_group(approach_k)
     factor = np.ones(len(servers.count))
+    within = _EXACT_FACTOR if config.hall.racks <= EXACT_RACKS else _LARGE_FACTOR
     for _ in range(_MOST_HEIGHT_ITERATIONS):
         inlet_c = _inlet_c(servers, supply_c, group_approach_k, factor)
         full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
         airflow = servers.count * full_m3s * _at_full_load(config, servers, inlet_c)[1]
         mean = servers.per_rack(airflow * servers.height_factor) / servers.per_rack(airflow)
         previous, factor = factor, servers.height_factor / servers.per_group(mean)
-        if np.max(np.abs(factor - previous)) < 1e-15:
+        if np.max(np.abs(factor - previous)) < within:
             break
     return factor
 

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sdc_taichi.config import HallConfig, LayoutConfig
 from sdc_taichi.errors import ConfigError
@@ -29,7 +31,7 @@ MOST_WEIGHTS = 2**27
 """Largest number of weights, or of runs, of a hall; this many weights take 1 GB in f64."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MixWeights:
     """Weights w of R racks, stored as runs of consecutive source racks.
 
@@ -57,9 +59,27 @@ class MixWeights:
     def apply(self, values: F64) -> F64:
         """Return the product of weights and rack values, (R,): the mix of outlet temperatures."""
         out, strong = np.zeros(len(self.norm)), values * self.strength
-        for racks, sources, weights in self._slices():
-            out += np.bincount(racks, weights * strong[sources], len(out))
-        return out * self.norm
+        if len(out) <= DENSE_RACKS:
+            for racks, sources, weights in self._slices():
+                out += np.bincount(racks, weights * strong[sources], len(out))
+            return out * self.norm
+        of_run = np.zeros(len(self.run_length))
+        windows = {n: sliding_window_view(strong, n) for n in np.unique(self.run_length) if n}
+        for runs in self._equal_runs:
+            length, at = self.run_length[runs[0]], self.run_first_weight[runs[0]]
+            sources = windows[length][self.run_first_rack[runs]]
+            # einsum adds in an order that does not depend on the number of threads.
+            of_run[runs] = np.einsum("ij,j->i", sources, self.weights[at : at + length])
+        rack = np.repeat(np.arange(len(out)), np.diff(self.run_offsets))
+        return np.asarray(np.bincount(rack, of_run, len(out)) * self.norm)
+
+    @cached_property
+    def _equal_runs(self) -> list[I64]:
+        """Indices of the runs that share their weights, for each distinct run of weights."""
+        key = self.run_first_weight * (np.int64(1) + self.run_length.max()) + self.run_length
+        order = np.argsort(key, kind="stable")
+        runs = np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+        return [of_key for of_key in runs if self.run_length[of_key[0]]]
 
     def apply_transposed(self, values: F64) -> F64:
         """Return the product of the transposed weights and rack values, (R,)."""

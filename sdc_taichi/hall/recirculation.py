@@ -24,7 +24,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.design_point import DesignPoint, design_point, design_point_at
+from sdc_taichi.hall.design_point import EXACT_RACKS, DesignPoint, design_point, design_point_at
 from sdc_taichi.hall.matrix_file import read_matrix, share_matrix
 from sdc_taichi.hall.mix_weights import MixWeights, dense_weights, layout_weights
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
@@ -39,10 +39,9 @@ _MOST_MEAN_SHARE = 0.9
 """Largest mean share of exhaust air in the intake of a row or hall; at larger shares, hardly any
 supply air would reach the racks."""
 _MOST_NEWTON_STEPS = 50
-_EXACT_RACKS, _LARGE_WITHIN_K = 10_000, 1e-3
-"""Largest number of racks for which the tolerance is ``_WITHIN_K`` if means of the approach
-temperatures are configured, and the tolerance in K for larger halls. An iteration reduces the
-change by a factor of 20 and takes a second in a hall of 100,000 racks."""
+_LARGE_WITHIN_K = 1e-3
+"""Tolerance for halls of more than EXACT_RACKS if means of the approach temperatures are
+configured, in K."""
 _CONTAINED_WITHIN_K = 1e-9
 """Tolerance of the iteration for the exhaust mixes of a hall with containment, in K."""
 
@@ -217,7 +216,7 @@ def _shares_by_exposure(
         share = _mean_share(config, mix_k, exposed, wanted_k)
         return share * mix_k, (share, design)
 
-    within_k = _WITHIN_K if config.hall.racks <= _EXACT_RACKS else _LARGE_WITHIN_K
+    within_k = _WITHIN_K if config.hall.racks <= EXACT_RACKS else _LARGE_WITHIN_K
     return _settled(config, wanted_k, update, within_k)
 
 
@@ -333,12 +332,19 @@ def _settled(
     Raises:
         ConfigError: The iteration does not converge.
     """
-    before_k = start_k
+    before_k, last_change_k = start_k, None
     for _ in range(_MOST_ITERATIONS):
         after_k, result = update(before_k)
-        if np.max(np.abs(after_k - before_k)) < within_k:
+        change_k = after_k - before_k
+        if np.max(np.abs(change_k)) < within_k:
             return result
         before_k = after_k
+        if within_k >= _LARGE_WITHIN_K and last_change_k is not None:
+            # Iterations are slow here, so add what later changes would sum up to if they kept
+            # shrinking by the same factor (Aitken 1926).
+            factor = np.sum(change_k * last_change_k) / np.sum(last_change_k**2)
+            before_k = after_k + factor / (1.0 - factor) * change_k if factor < 0.5 else after_k
+        last_change_k = change_k
     raise ConfigError(
         f"{config.hall.recirculation.matrix_file or config.name}: the hall finds no steady state "
         "at full load; valid is less recirculation"
