@@ -43,6 +43,7 @@ from .hall_arguments import (
     BLOCK_TERMS,
     DONE,
     LANES,
+    MODE_VECTORS,
     N_BLOCK_TERMS,
     N_TERMS,
     RUNNING,
@@ -58,6 +59,7 @@ from .mixes import (
     exchange_dense,
     look_up_steady_state,
     next_mix,
+    set_mode_amounts,
     status_after_sweep,
     update_shift,
 )
@@ -75,6 +77,7 @@ from .sums import (
     sum_chunk,
 )
 from .units import (
+    extrapolate_units,
     follow_hottest_inlet,
     keep_supply,
     run_coils,
@@ -89,7 +92,7 @@ END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
 
 @ti.func
 @no_type_check
-def describe_sweep(hall: ti.template(), n, exchanges_after, reference_c):
+def describe_sweep(hall: ti.template(), n, slice_at, exchanges_after, reference_c):
     """Return the state of a data center before a sweep, as a struct for functions of the sweep."""
     dc = hall.dcs[n]
     sweep = ti.Struct(
@@ -104,6 +107,7 @@ def describe_sweep(hall: ti.template(), n, exchanges_after, reference_c):
         shift_k=ti.cast(dc.shift_k, hall.real),
         # Supply air, the reference temperature where mixes are computed as differences.
         reference_c=reference_c,
+        first_amount=slice_at * (MODE_VECTORS * LANES),
     )
     if sweep.exchanges_before:
         sweep.side = 1 - sweep.side
@@ -279,7 +283,10 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
             load_w += units.fan_m3s * dc.crac_fan_w_per_m3s
             moved_k = ti.max(moved_k, set_supply(hall, n, units, air.units_return_c, 0.0, load_w))
         dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, moved_k, is_last)
-        if dc.adjusts_supply > 0.0 and dc.status != RUNNING:
+        if dc.status == RUNNING:
+            outlet_c = total.outlet_sum_c / ti.cast(dc.racks, ti.f64)
+            extrapolate_units(hall, n, ti.abs(outlet_c - air.supply_c))
+        elif dc.adjusts_supply > 0.0:
             keep_supply(hall, n)
         if dc.first_mix_weight < 0:
             dc.exchanges_before = ti.cast(exchanges, ti.i32)
@@ -374,7 +381,7 @@ def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hotte
 
 @ti.func
 @no_type_check
-def run_task(hall: ti.template(), terms_at, first_chunk, end_chunk):
+def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
     """Run all sweeps of a data center, or one sweep of some of its chunks.
 
     A data center that is split into several tasks synchronises its chunks after every sweep.
@@ -383,17 +390,20 @@ def run_task(hall: ti.template(), terms_at, first_chunk, end_chunk):
     dc = hall.dcs[n]
     n_chunks = hall.dcs[n + 1].first_chunk - dc.first_chunk
     sweeps_left = hall.sweeps if end_chunk - first_chunk == n_chunks else 1
-    exchanges_after, amounts = False, hall.zeros
+    exchanges_after, amounts, terms_at = False, hall.zeros, slice_at * SCRATCH
+    reference_c = ti.cast(hall.units[dc.first_unit].supply_c, hall.real)
     if ti.static(hall.recirculates and not hall.transient):
         exchanges_after = dc.first_mix_weight >= 0
         if dc.sweep == 0:
-            amounts = look_up_steady_state(hall, n)
-    reference_c = ti.cast(hall.units[dc.first_unit].supply_c, hall.real)
+            if exchanges_after:
+                amounts = look_up_steady_state(hall, n)
+            else:
+                set_mode_amounts(hall, n, slice_at, reference_c)
     servers = server_model(hall, n)
     warming = warming_model(hall, n, servers)
     hottest = no_hottest(hall)
     while sweeps_left > 0 and dc.status == RUNNING:
-        sweep = describe_sweep(hall, n, exchanges_after, reference_c)
+        sweep = describe_sweep(hall, n, slice_at, exchanges_after, reference_c)
         for chunk_at in range(first_chunk, end_chunk):
             compute_chunk(
                 hall,
@@ -425,8 +435,7 @@ def run_slice(hall: ti.template(), slice_at):
     n_tasks = hall.task_offsets.shape[0] - 1
     first, end = part_of(slice_at, hall.slices, n_tasks)
     for task in range(first, end):
-        terms_at = slice_at * SCRATCH
-        run_task(hall, terms_at, hall.task_offsets[task], hall.task_offsets[task + 1])
+        run_task(hall, slice_at, hall.task_offsets[task], hall.task_offsets[task + 1])
 
 
 @cache

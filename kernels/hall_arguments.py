@@ -39,12 +39,10 @@ RANKS_PER_K = 2.0**27
 temperatures of equal racks differ in their last bits, depending on the processor. Their ranks,
 7.5 nK apart, are equal. Adjacent numbers in f32 are further apart than ranks."""
 MIX_PATTERNS = LANES - 1
-"""Number of exhaust mix patterns in the table of steady states. An entry of the table is a vector
-of the amount of each pattern, followed by the feedback gain."""
-EXHAUST_PATTERNS = 2
-"""Number of exhaust patterns of sparse halls; they share the amounts of the first mix patterns."""
-PATTERNS = MIX_PATTERNS + EXHAUST_PATTERNS
-"""Number of pattern vectors per block."""
+"""Number of exhaust mix patterns in the table of steady states of a dense hall. An entry of the
+table is a vector of the amount of each pattern, followed by the feedback gain."""
+MODE_VECTORS = 3
+"""Largest number of vectors of LANES modes of a sparse hall."""
 
 BLOCK_INTS = {
     "racks": "racks in the block, 1..LANES; the other lanes are padding",
@@ -74,9 +72,12 @@ DC_INTS = {
     "first_share": "first entry in unit_shares",
     "racks": "number of racks",
     "first_mix_weight": "first entry in mix_weights of dense halls, -1 for sparse halls",
-    "first_pattern": "first entry in steady_states of the patterns of the hall, by block",
-    "first_steady_state": "first entry in steady_states of the table of pattern amounts",
-    "supply_rows": "number of supply temperatures in the table",
+    "first_pattern": "first entry in steady_states of the patterns or modes of the hall, by block",
+    "first_steady_state": "first entry in steady_states of the table of pattern amounts (dense "
+    "halls), or of the amounts of the modes per kelvin of each sampled rack (sparse halls)",
+    "supply_rows": "number of supply temperatures in the table (dense halls)",
+    "modes": "number of modes, and of sampled racks (sparse halls)",
+    "first_sample": "first entry in sample_outlet_c (sparse halls)",
 }
 DC_CONTROL = {
     "status": "RUNNING, DONE or NOT_CONVERGED",
@@ -172,6 +173,8 @@ UNIT_STATE = {
     "speed": "fan speed / full speed in the present sweep",
     "excess_k": "next sweep's supply air minus setpoint and warmth of the room, K",
     "mean_supply_c": "supply air, in transient halls the mean of the substeps so far, C",
+    "last_f_change": "change of fresh_ratio in the sweep before (steady air)",
+    "last_supply_change_k": "change of supply air in the sweep before, K (steady air)",
 }
 RACK_STATE = {
     "mixed_c": "exhaust mix before the rack; transient: room air at its intake, C",
@@ -301,7 +304,8 @@ ARGUMENTS = {
     "unit_shares": _vectors(1),  # share of each unit in a rack's supply, s of docs/hall.md
     "mix_weights": _vectors(1, lanes=DENSE_LANES * LANES),  # of dense halls
     "run_weights": _vectors(1, lanes=RUN_LANES),  # of sparse halls
-    "steady_states": _vectors(1),  # patterns of each hall, then its table of amounts
+    "steady_states": _vectors(1),  # patterns or modes of each hall, and what gives their amounts
+    "sample_outlet_c": _numbers("real", 1),  # outlets of the sampled racks of sparse halls
     # State that is carried from sweep to sweep.
     "dc_control": _numbers("i32", 2, DC_CONTROL, "dcs"),
     "dc_doubles": _numbers("f64", 2, DC_DOUBLES, "dcs"),
@@ -314,6 +318,8 @@ ARGUMENTS = {
     "server_c_after": _numbers("real", 1),  # group temperatures at step end
     # Work space.
     "scratch": _vectors(1),
+    "mode_amounts": _vectors(1),  # amounts of the modes, MODE_VECTORS for each slice
+    "mode_amount": _numbers("real", 1),  # the memory of mode_amounts, by mode
     "unit_need_m3s": _numbers("f64", 1),  # supply air that a chunk demands from each unit
     "chunk_sums": _numbers("f64", 1, SUMS, "chunks"),
     "group_values": _vectors(2, GROUP_OUT, "values"),
@@ -336,6 +342,7 @@ _LAYERS_ALONE = (
 _STEP_ALONE = (
     *("sweeps", "load_columns", "substep_s", "weight", "tolerance_k", "task_offsets"),
     *("run_offsets", "run_ints", "unit_inputs", "mix_weights", "run_weights", "steady_states"),
+    *("sample_outlet_c", "mode_amounts", "mode_amount"),
     *("dc_control", "rack_state_by_4", "rack_state_by_16", "server_c_before", "server_c_after"),
     *("scratch", "unit_need_m3s", "chunk_sums", "dc_out"),
 )

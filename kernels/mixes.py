@@ -29,12 +29,11 @@ from .decay import halvings_for, phi1, power_of_half
 from .hall_arguments import (
     DENSE_LANES,
     DONE,
-    EXHAUST_PATTERNS,
     LANES,
     MIX_PATTERNS,
+    MODE_VECTORS,
     N_BLOCK_TERMS,
     NOT_CONVERGED,
-    PATTERNS,
     RACK_STATE,
     RUN_BLOCKS,
     RUN_LANES,
@@ -45,7 +44,7 @@ from .sums import store_change_range
 EXHAUST_ROW = row_index(RACK_STATE, "exhaust_c")
 """Row of side 0 of the exhausts; the next row is side 1."""
 MIX_INPUT_ROW = row_index(RACK_STATE, "mix_input_k")
-ALIKE = 0.25
+ALIKE = 0.5
 """Largest spread of outlet changes, as a share of the tolerance, for a shift of the mixes instead
 of an exchange. Spread is the deviation from the midpoint of the changes since the last exchange. It
 bounds the error of the mixes, and sweeps can still converge within the tolerance."""
@@ -108,6 +107,31 @@ def look_up_steady_state(hall: ti.template(), n):
 
 @ti.func
 @no_type_check
+def set_mode_amounts(hall: ti.template(), n, slice_at, supply_c):
+    """Set the amounts of the modes of a sparse hall from the outlets of its sampled racks."""
+    dc = hall.dcs[n]
+    n_vectors = (dc.modes + (LANES - 1)) // LANES
+    at, sample = dc.first_steady_state, 0
+    v = 0
+    while v < n_vectors:
+        hall.mode_amounts[slice_at * MODE_VECTORS + v] = hall.zeros
+        v += hall.one
+    while sample < dc.modes:
+        outlet_k = hall.sample_outlet_c[dc.first_sample + sample] - supply_c
+        v = 0
+        while v < n_vectors:
+            # Taichi would add in place atomically.
+            amounts = hall.mode_amounts[slice_at * MODE_VECTORS + v]
+            hall.mode_amounts[slice_at * MODE_VECTORS + v] = (
+                amounts + hall.steady_states[at] * outlet_k
+            )
+            at += hall.one
+            v += hall.one
+        sample += hall.one
+
+
+@ti.func
+@no_type_check
 def guess_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
     """Return the first guess of the exhaust mix before the racks of a block, in C.
 
@@ -115,16 +139,23 @@ def guess_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
     """
     block, chunk_0 = hall.blocks[block_at], hall.dcs[n].first_chunk
     pattern_at = hall.dcs[n].first_pattern
-    pattern_at += (block_at - hall.chunks[chunk_0].first_block) * PATTERNS
+    block_in_hall = block_at - hall.chunks[chunk_0].first_block
     mix_c = hall.zeros + sweep.reference_c
     if sweep.exchanges_after:
+        pattern_at += block_in_hall * MIX_PATTERNS
         for k in ti.static(range(MIX_PATTERNS)):
             mix_c += hall.steady_states[pattern_at + k] * amounts[k]
     else:
-        exhaust_c = mix_c
-        for k in ti.static(range(EXHAUST_PATTERNS)):
-            mix_c += hall.steady_states[pattern_at + k] * amounts[k]
-            exhaust_c += hall.steady_states[pattern_at + MIX_PATTERNS + k] * amounts[k]
+        exhaust_c, modes = mix_c, hall.dcs[n].modes
+        pattern_at += block_in_hall * 2 * modes
+        amount_at = sweep.first_amount
+        end = amount_at + modes
+        while amount_at < end:
+            amount = hall.mode_amount[amount_at]
+            mix_c += hall.steady_states[pattern_at] * amount
+            exhaust_c += hall.steady_states[pattern_at + 1] * amount
+            pattern_at += 2
+            amount_at += hall.one
         exhaust_c *= block.strength
         hall.rack_state[EXHAUST_ROW + sweep.side, block_at] = exhaust_c
         block.unshifted_mix_c = mix_c

@@ -12,6 +12,15 @@ USUAL_RISE_K = 15.0
 """Typical temperature rise of air through servers, in K, for the gain of the fan control."""
 FAN_RAMP_S = 30.0
 """Time constant of fans that follow the hottest inlet in transient halls, in s."""
+EXTRAPOLATES_FROM, EXTRAPOLATES_EVERY = 20, 5
+"""First sweep after which the units are extrapolated, since most halls have steady air by then, and
+period in sweeps; the sweeps between show the factor by which changes shrink."""
+SLOW_FACTOR, MOST_EXTRAPOLATED = 0.3, 100.0
+"""Factor of successive changes from which the units are extrapolated, and largest multiple of the
+present change that is added."""
+COVERED_WITHIN = 1e-6
+"""Share of their need that units may seem to lack although they cover it. At the design point units
+deliver just what racks need."""
 MOST_PASSES = 100
 """Maximum number of passes over the coils of a data center; each pass may saturate a coil."""
 
@@ -264,6 +273,54 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
             unit.supply_c = ti.cast(unit.setpoint_c, ti.f64) + warmed_k
             at += hall.one
     return load_w, coil_w
+
+
+@ti.func
+@no_type_check
+def extrapolate_units(hall: ti.template(), n, above_k):
+    """Extrapolate the units of a data center where their sweeps approach the steady air slowly.
+
+    Warmer servers draw more air, of which units at full speed cover a smaller share, and coils at
+    their limit supply warmer air, so servers become still warmer. Then each sweep changes both by
+    a factor just below 1 times the change before, and the remaining changes sum up to that factor
+    divided by 1 minus the factor, times the present change (Aitken 1926).
+
+    Args:
+        hall: arguments of the hall kernel.
+        n: index of the data center.
+        above_k: mean outlet minus supply temperature, by which a change of the share that the units
+            cover changes the inlets, in K.
+    """
+    product, square, none = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    sweep, at = hall.dcs[n].sweep, hall.dcs[n].first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        f_change = unit.fresh_ratio - unit.fresh_ratio_used
+        supply_change_k = unit.supply_c - unit.mean_supply_c
+        product += f_change * unit.last_f_change * above_k * above_k
+        product += supply_change_k * unit.last_supply_change_k
+        square += unit.last_f_change * unit.last_f_change * above_k * above_k
+        square += unit.last_supply_change_k * unit.last_supply_change_k
+        at += hall.one
+    factor, share = none, none
+    is_due = sweep >= EXTRAPOLATES_FROM and sweep % EXTRAPOLATES_EVERY == 0
+    if is_due and square > hall.tolerance_k * hall.tolerance_k:
+        factor = product / square
+        if factor > SLOW_FACTOR and factor < 1.0:
+            share = ti.min(factor / (1.0 - factor), MOST_EXTRAPOLATED)
+    at = hall.dcs[n].first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        f_change = unit.fresh_ratio - unit.fresh_ratio_used
+        supply_change_k = unit.supply_c - unit.mean_supply_c
+        unit.last_f_change = f_change
+        unit.last_supply_change_k = supply_change_k
+        unit.fresh_ratio = ti.min(ti.max(unit.fresh_ratio + share * f_change, 0.0), 1.0)
+        # The error of the mixes would otherwise grow in servers that draw more air when warmer.
+        if factor >= 1.0 and unit.fresh_ratio > 1.0 - COVERED_WITHIN:
+            unit.fresh_ratio = 1.0
+        unit.supply_c = unit.supply_c + share * supply_change_k
+        at += hall.one
 
 
 @ti.func

@@ -34,9 +34,9 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall.design_point import DesignPoint
-from sdc_taichi.hall.mix_weights import DENSE_RACKS
 from sdc_taichi.hall.rack_servers import RackServers
 from sdc_taichi.hall.recirculation import Recirculation
+from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.plant.air import DensityRatio
 from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F32, F64, I32
@@ -52,8 +52,9 @@ MOST_SUPPLIES = 65
 PATTERNS = 7
 """Largest number of patterns of a hall. For 20 racks, 7 patterns reproduce all mixes to within
 2e-4 K."""
-SAMPLED_RACKS = 4
-"""Number of sampled racks whose mean represents all racks of a hall with truncated weights."""
+_SAMPLED_LOADS_STEP = 8
+"""Step through the loads of the table for the sampled racks of a large hall, interpolated between
+them: these racks are so few that another of their sweeps costs little."""
 
 _BATCH_VALUES, _LEAST_BATCH = 2**13, 32
 """Number of values per batch, chosen so that a batch fits into the processor's cache, and smallest
@@ -63,7 +64,7 @@ _SECANT_K = 1e-3
 _LAST_STEP_K = 2e-3
 """Newton step below which the iteration ends, in K; the next step would be 50 to 100 times
 smaller."""
-_USUAL_GAIN = 0.2
+USUAL_GAIN = 0.2
 """Initial value of the feedback gains, which is typical of halls."""
 _MOST_GAIN = 0.9
 """Largest absolute value of a feedback gain."""
@@ -85,51 +86,48 @@ class SteadyStateTable:
     supply_c: F64
     """Supply temperatures of the table, evenly spaced, in C, (n,)."""
     patterns: F64
-    """Patterns over the racks, (k, R). In halls of up to DENSE_RACKS they are patterns of exhaust
-    mix minus supply temperature. In larger halls the shape is (4, R), and the rows are values of
-    the design point in K: mix of approach temperatures, mix of temperature rises, approach
-    temperatures, and temperature rises."""
+    """Patterns of exhaust mix minus supply temperature over the racks, (k, R)."""
     pattern_shares: F32
-    """Coefficients of the patterns in each steady state, (n, len(TABLE_LOADS), k). In larger halls
-    k is 2: one coefficient scales both patterns of approaches, the other both patterns of rises."""
+    """Coefficients of the patterns in each steady state, (n, len(TABLE_LOADS), k)."""
     feedback_gain: F32
     """Change of a rack's outlet divided by the change of its exhaust mix, in K/K, averaged over the
     racks, (n, len(TABLE_LOADS))."""
 
 
 def initial_guess(
-    config: DataCenterConfig, servers: RackServers, recirculation: Recirculation
+    config: DataCenterConfig,
+    servers: RackServers,
+    recirculation: Recirculation,
+    modes: SteadyModes | None = None,
 ) -> SteadyStateTable:
-    """Compute the table of steady states of a hall.
+    """Compute the table of steady states of a hall, or of the sampled racks of a large hall.
 
-    All racks have the same load, and the CRAC units supply enough air. In halls of up to
-    DENSE_RACKS all racks are computed; larger halls are represented by a mean of SAMPLED_RACKS
-    racks.
+    All racks have the same load, and the CRAC units supply enough air.
 
     Args:
         config: The data center.
         servers: Servers of the hall, see ``rack_servers``.
         recirculation: Calibrated recirculation of the hall.
+        modes: Modes of a large hall, whose sampled racks are computed; None computes all racks.
     """
-    supply_c = _table_supplies_c(config, recirculation.design)
-    dense = config.hall.racks <= DENSE_RACKS
-    part = (_whole_hall if dense else _sampled_racks)(servers, recirculation)
-    states = _steady_states(config, servers, part, recirculation, supply_c)
-    if dense:
-        patterns, shares = _strongest_patterns(states.mix_k[:, :-1])
-    else:
-        patterns, shares = _design_patterns(states, recirculation)
+    supply_c = table_supplies_c(config, recirculation.design)
+    loads = TABLE_LOADS if modes is None else TABLE_LOADS[::_SAMPLED_LOADS_STEP]
+    part = _hall_part(servers, recirculation, modes)
+    states = _steady_states(config, servers, part, recirculation, supply_c, loads)
+    patterns, shares = _strongest_patterns(states.mix_k[:, :-1])
     gain = states.feedback_gain.mean(axis=0)[:-1]
-    grid = len(supply_c), len(TABLE_LOADS)
+    rows = np.concatenate([shares, gain[None]]).reshape(-1, len(loads))
+    between = np.stack([np.interp(TABLE_LOADS, loads, row) for row in rows])
+    table = between.reshape(-1, len(supply_c), len(TABLE_LOADS)).astype(np.float32)
     return SteadyStateTable(
         supply_c=supply_c,
         patterns=patterns,
-        pattern_shares=shares.T.reshape(*grid, -1).astype(np.float32),
-        feedback_gain=gain.reshape(grid).astype(np.float32),
+        pattern_shares=np.moveaxis(table[:-1], 0, 2),
+        feedback_gain=table[-1],
     )
 
 
-def _table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
+def table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
     """Return supply temperatures that cover the range of setpoints, in C, (n,)."""
     setpoint = config.hvac.setpoint
     over_k = design.setpoint_over_supply_k(config)
@@ -140,7 +138,7 @@ def _table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
 
 
 class _HallPart(NamedTuple):
-    """Racks whose steady states are computed: all racks, or a sample merged into one rack."""
+    """Racks whose steady states are computed: all racks, or the sampled racks of a large hall."""
 
     group_offsets: I32
     """Index of the first server group of each of R racks, and the number of groups, (R + 1,)."""
@@ -150,34 +148,25 @@ class _HallPart(NamedTuple):
     and exhaust share."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
-    design_mix_k: F64
-    """Exhaust mix of each rack minus supply temperature at the design point, in K, (R,)."""
+    first_mix_k: F64
+    """First estimate of the exhaust mix of each rack minus supply temperature, in K, (R,)."""
 
 
-def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart:
-    """Return all racks of a hall."""
-    weights = recirculation.mix_weights
+def _hall_part(
+    servers: RackServers, recirculation: Recirculation, modes: SteadyModes | None
+) -> _HallPart:
+    """Return all racks of a hall, or the racks that its modes sample."""
+    offsets, columns = servers.group_offsets, _columns(servers, recirculation)
+    outlet_k = recirculation.design.outlet_rise_k
+    if modes is None:
+        weights = recirculation.mix_weights
+        return _HallPart(offsets, columns, weights.dense(), weights.apply(outlet_k))
+    groups = [np.arange(*offsets[rack : rack + 2]) for rack in modes.racks]
     return _HallPart(
-        group_offsets=servers.group_offsets,
-        columns=_columns(servers, recirculation),
-        weights=weights.dense(),
-        design_mix_k=weights.apply(recirculation.design.outlet_rise_k),
-    )
-
-
-def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallPart:
-    """Return a sample of the racks, merged into one rack that takes in its own exhaust air."""
-    offsets, outlet_rise_k = servers.group_offsets, recirculation.design.outlet_rise_k
-    racks = len(outlet_rise_k)
-    # The sample is spread over the exhaust shares, which are larger at the ends of rows.
-    places = (2 * np.arange(SAMPLED_RACKS) + 1) * racks // (2 * SAMPLED_RACKS)
-    sample = np.sort(np.argsort(recirculation.exhaust_share, kind="stable")[places])
-    groups = np.concatenate([np.arange(*offsets[rack : rack + 2]) for rack in sample])
-    return _HallPart(
-        group_offsets=np.array([0, len(groups)], dtype=np.int32),
-        columns=_columns(servers, recirculation)[:, groups],
-        weights=np.ones((1, 1)),
-        design_mix_k=outlet_rise_k[sample].mean(keepdims=True),
+        group_offsets=np.cumsum([0, *map(len, groups)], dtype=np.int32),
+        columns=columns[:, np.concatenate(groups)],
+        weights=modes.sample_weights,
+        first_mix_k=outlet_k[modes.racks],
     )
 
 
@@ -203,19 +192,20 @@ def _steady_states(
     part: _HallPart,
     recirculation: Recirculation,
     supply_c: F64,
+    loads: F64,
 ) -> _SteadyStates:
     """Compute the steady states of the whole table and, as the last entry, of the design point."""
     design = recirculation.design
-    shape = len(part.design_mix_k), len(supply_c) * len(TABLE_LOADS) + 1
+    shape = len(part.first_mix_k), len(supply_c) * len(loads) + 1
     states = _SteadyStates(
         curves=config.servers.curves,
         weights=part.weights,
         density_ratio=servers.air.density_ratio,
         k_per_w=1.0 / (float(design.full_airflow_m3s.max()) * design.air_j_per_m3_k),
-        supply_c=np.append(np.repeat(supply_c, len(TABLE_LOADS)), design.supply_c),
-        load=np.append(np.tile(TABLE_LOADS, len(supply_c)), 1.0),
-        mix_k=np.broadcast_to(part.design_mix_k[:, None], shape),
-        feedback_gain=np.full(shape, _USUAL_GAIN),
+        supply_c=np.append(np.repeat(supply_c, len(loads)), design.supply_c),
+        load=np.append(np.tile(loads, len(supply_c)), 1.0),
+        mix_k=np.broadcast_to(part.first_mix_k[:, None], shape),
+        feedback_gain=np.full(shape, USUAL_GAIN),
     )
     groups = _by_rack(part.group_offsets, part.columns)
     merged = _by_rack(*_merge_neighbours(part.group_offsets, part.columns))
@@ -235,19 +225,6 @@ def _strongest_patterns(mix_k: F64) -> tuple[F64, F64]:
     # threads for it.
     patterns = np.linalg.eigh(mix_k @ mix_k.T)[1].T[: -PATTERNS - 1 : -1]
     return patterns, patterns @ mix_k
-
-
-def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tuple[F64, F64]:
-    """Return the patterns of the design point, (4, R), and their coefficients, (2, m).
-
-    The coefficients are mean approach and mean temperature rise divided by their design values.
-    """
-    scales = np.concatenate([states.inlet_k, states.heat_k])
-    shares = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
-    design = recirculation.design
-    racks = np.stack([design.approach_k, design.outlet_rise_k - design.approach_k])
-    mixes = [recirculation.mix_weights.apply(row) for row in racks]
-    return np.concatenate([mixes, racks]), shares
 
 
 @dataclass(slots=True)
@@ -271,10 +248,6 @@ class _SteadyStates:
     """Exhaust mix of each rack minus supply temperature, in K, (R, m)."""
     feedback_gain: F64
     """Change of each rack's outlet divided by the change of its exhaust mix, in K/K, (R, m)."""
-    inlet_k: F64 | None = None
-    """Airflow-weighted mean inlet of each rack minus supply temperature, in K, (R, m)."""
-    heat_k: F64 | None = None
-    """Temperature rise of the air through each rack, in K, (R, m)."""
 
     def solve(self, groups: F64, passes: int) -> None:
         """Take Newton steps towards mixes that are consistent with their outlets.
@@ -312,13 +285,10 @@ class _SteadyStates:
         self.feedback_gain = np.clip(gain, -_MOST_GAIN, _MOST_GAIN)
 
     def _outlet_k(self, groups: F64) -> F64:
-        """Return outlet minus supply temperatures for the present mixes, in K, (R, m).
-
-        The outlet is the sum of ``inlet_k`` and ``heat_k``, which this method also updates.
-        """
+        """Return outlet minus supply temperatures for the present mixes, in K, (R, m)."""
         rows = (row[..., None] for row in groups)
         count, full_w, idle_w, deviation, full_airflow, fan_w, exhaust_share = rows
-        self.inlet_k, self.heat_k = np.empty_like(self.mix_k), np.empty_like(self.mix_k)
+        outlet_k = np.empty_like(self.mix_k)
         batch = max(_LEAST_BATCH, _BATCH_VALUES // count.size)
         for first in range(0, len(self.load), batch):
             at = slice(first, first + batch)
@@ -333,9 +303,9 @@ class _SteadyStates:
             ratio = ratio * (count * full_airflow)
             flow = np.maximum(np.sum(ratio, axis=1), 1e-9)
             heat_k = np.sum(power_w * count, axis=1) / flow * self.k_per_w
-            self.heat_k[:, at] = np.minimum(heat_k, _MOST_HEAT_K)
-            self.inlet_k[:, at] = np.sum(inlet_k * ratio, axis=1) / flow
-        return np.asarray(self.inlet_k + self.heat_k)
+            inlet_k = np.sum(inlet_k * ratio, axis=1) / flow
+            outlet_k[:, at] = inlet_k + np.minimum(heat_k, _MOST_HEAT_K)
+        return outlet_k
 
 
 def _by_rack(group_offsets: I32, columns: F64) -> F64:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -17,9 +18,10 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point, odd_airflow
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
-from sdc_taichi.hall.mix_weights import MixWeights
+from sdc_taichi.hall.mix_weights import DENSE_RACKS, MixWeights
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.hall.recirculation import Recirculation, calibrate
+from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import in_row_order
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
@@ -61,6 +63,11 @@ SHARED_FIELDS = (
 """Config paths whose values must be equal in all data centers of a fleet."""
 
 
+SteadyStates = SteadyStateTable | Callable[[SteadyModes], SteadyStateTable]
+"""Table of steady states of a hall of up to DENSE_RACKS; for larger halls, the function that
+computes the table of the racks that the modes of the hall sample."""
+
+
 @dataclass(frozen=True, slots=True)
 class HallAir:
     """Recirculation and CRAC supply of the R racks of B data centers."""
@@ -77,10 +84,10 @@ class HallAir:
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
     unit_share_offsets: I32
     """First entry of each data center in ``unit_shares``, and the number of entries, (B + 1,)."""
-    steady_states: tuple[SteadyStateTable, ...]
-    """Tables of steady states, the initial guesses of the solver, one per distinct hall."""
+    steady_states: tuple[SteadyStates, ...]
+    """Source of the solver's initial guesses for each distinct hall."""
     steady_state_of_dc: I32
-    """Index of each data center's table in ``steady_states``, (B,)."""
+    """Index of each data center's hall in ``steady_states``, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,8 +267,8 @@ class _Air:
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
     rack_need_m3s: F64
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
-    steady_states: SteadyStateTable
-    """Table of steady states, the initial guesses of the solver."""
+    steady_states: SteadyStates
+    """Source of the solver's initial guesses."""
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -376,12 +383,15 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         approach_k = design.approach_k
         shares, unit_design_m3s = _unit_supply(config, recirculation)
         of_groups = servers.per_rack(recirculation.group_exhaust_share)
+        steady_states: SteadyStates = partial(initial_guess, config, servers, recirculation)
+        if hall.racks <= DENSE_RACKS:
+            steady_states = initial_guess(config, servers, recirculation)
         air = _Air(
             mix_weights=recirculation.mix_weights,
             exhaust_share=of_groups / servers.per_rack(servers.height_factor),
             unit_shares=shares,
             rack_need_m3s=recirculation.need_m3s,
-            steady_states=initial_guess(config, servers, recirculation),
+            steady_states=steady_states,
         )
     else:
         design = design_point(config, servers)

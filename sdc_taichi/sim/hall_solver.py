@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import product
 from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
 
 from sdc_taichi.errors import RuntimeStateError, SdcError
-from sdc_taichi.hall.initial_guess import TABLE_LOADS
+from sdc_taichi.hall.initial_guess import TABLE_LOADS, USUAL_GAIN
+from sdc_taichi.hall.steady_modes import SteadyModes, extended_modes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.hall_arguments import (
     DC_COEFFICIENTS,
     DC_CONTROL,
     DC_OUT,
+    DONE,
     LANES,
     LAYERS_ARGUMENTS,
     LOADS_PER_DC,
     LOADS_PER_GROUP,
     LOADS_PER_RACK,
+    MODE_VECTORS,
     NOT_CONVERGED,
     OUTLETS,
     RACK_OUT,
@@ -28,9 +32,21 @@ from sdc_taichi.kernels.hall_arguments import (
     STEP_ARGUMENTS,
 )
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
+from sdc_taichi.sim.hall_tables import (
+    build_hall_tables,
+    build_rows_along_racks,
+    build_steady_states,
+    vectors,
+)
 from sdc_taichi.sim.inlet_parts import IntakeAir, read_intake_air
 from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
+from sdc_taichi.sim.sampled_halls import (
+    LEVELS,
+    SUPPLY_SHARES,
+    sampled_fleet,
+    sparse_halls,
+    supply_range_c,
+)
 from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
 
 
@@ -82,6 +98,12 @@ SLICES_PER_THREAD = 8
 """Number of work slices per thread; several slices balance the load of the threads."""
 TOLERANCE_K: dict[Precision, float] = {"f32": 2e-4, "f64": 1e-12}
 """Convergence tolerance in K: change of the exhaust mix before any rack by a further sweep."""
+SAMPLE_TOLERANCE_K: dict[Precision, float] = {"f32": 5e-5, "f64": 1e-8}
+"""Convergence tolerance of sampled racks in K, small enough that large halls rarely need a second
+sweep for it."""
+SAMPLE_SWEEPS = 20
+"""Largest number of sweeps of sampled racks; without success large halls start from the supply
+temperature."""
 MOST_SWEEPS = 2000
 """Maximum number of sweeps. Steady states take 2 to 40 sweeps, and several hundred if the CRAC
 units supply a tenth of the airflow of the servers."""
@@ -214,6 +236,11 @@ class Hall:
         """True if the last step was transient; None if there is no last step."""
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
         """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
+        self._sparse_dcs = sparse_halls(fleet)
+        self._sample: Hall | None = None
+        """Sampled racks of the data centers ``_sparse_dcs``; None if there are none."""
+        if len(self._sparse_dcs):
+            self._add_sampled_racks(precision)
 
     @property
     def sweeps(self) -> I32:
@@ -238,6 +265,8 @@ class Hall:
         if not self._recirculates:
             self._call_step_kernel(dc_out)
         else:
+            if self._sample is not None:
+                self._solve_sampled_racks(self._sample, conditions)
             self._run_sweeps(dc_out, MOST_SWEEPS)
             status = self._control["status"]
             if np.minimum.reduce(status) == NOT_CONVERGED:
@@ -469,6 +498,99 @@ class Hall:
             row[:] = value
         for name in ("shift_k", "last_change_k", "last_shift_k"):
             self._dc[name][:] = 0.0
+
+    def _add_sampled_racks(self, precision: Precision) -> None:
+        """Compute the modes of all sparse halls, and the racks that they sample.
+
+        Equal halls are computed once. Their CRAC units run at full speed and supply air at their
+        setpoints.
+        """
+        air = self._fleet.air
+        assert air is not None
+        entries, first = np.unique(air.steady_state_of_dc[self._sparse_dcs], return_index=True)
+        dcs = dict(zip(entries.tolist(), self._sparse_dcs[first].tolist(), strict=True))
+        modes: dict[int, SteadyModes] = {}
+        controls = [self._dc[name] for name in ("adjusts_supply", "inlet_target_c")]
+        usual = [row.copy() for row in controls]
+        for row in controls:
+            row[:] = 0.0
+        self._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
+        self._dc["feedback_gain"][:] = USUAL_GAIN
+        for loads in LEVELS:
+            states = self._steady_states([*dcs.values()], loads)
+            modes = {
+                entry: extended_modes(modes.get(entry), *states[dc], MODE_VECTORS * LANES)
+                for entry, dc in dcs.items()
+            }
+            self._set_modes(modes, precision)
+        self._step_kernel.bind(tolerance_k=TOLERANCE_K[precision])
+        for row, values in zip(controls, usual, strict=True):
+            row[:] = values
+
+    def _steady_states(self, dcs: list[int], loads: F64) -> dict[int, Reals]:
+        """Compute steady states of data centers at ``SUPPLY_SHARES`` and the given loads.
+
+        Returns:
+            Outlets and exhaust mixes minus supply temperatures of each data center, in K,
+            (2, states, racks); states without steady air are missing.
+        """
+        fleet, places = self._fleet, self._places
+        low_c, high_c = supply_range_c(fleet)
+        others = np.isin(np.arange(fleet.size), dcs, invert=True)
+        states: dict[int, list[Reals]] = {dc: [] for dc in dcs}
+        for share, load in product(SUPPLY_SHARES, loads):
+            supply_c = low_c + share * (high_c - low_c)
+            conditions = Conditions(supply_c[fleet.unit_dc], np.full(fleet.size, load))
+            self._set_conditions(conditions)
+            self._unit_state["fresh_ratio"][:] = 1.0
+            self._begin_step(exchanges_before=0)
+            self._control["status"][others] = DONE
+            if self._sample is not None:
+                self._solve_sampled_racks(self._sample, conditions)
+            self._run_sweeps(np.empty((len(DC_OUT), fleet.size)), MOST_SWEEPS)
+            outlet_c = self._exhaust() * self._rack["per_strength"]
+            air_c = places.values_of_racks(np.stack([outlet_c, self._memory["mixed_c"]]))
+            for dc, of_dc in states.items():
+                air_k = air_c[:, slice(*fleet.rack_offsets[dc : dc + 2])] - supply_c[dc]
+                if self._control["status"][dc] == DONE and np.isfinite(air_k).all():
+                    of_dc.append(air_k.astype(self._dtype))
+        racks = np.diff(fleet.rack_offsets)
+        return {
+            dc: np.array(of_dc, self._dtype).reshape(-1, 2, racks[dc]).swapaxes(0, 1)
+            for dc, of_dc in states.items()
+        }
+
+    def _set_modes(self, modes: dict[int, SteadyModes], precision: Precision) -> None:
+        """Let the sweeps of sparse halls start from their modes and sampled racks."""
+        fleet, tables = self._fleet, self._tables
+        sample = Hall(sampled_fleet(fleet, self._sparse_dcs, modes), precision)
+        sample._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
+        array, rows = build_steady_states(fleet, self._places, self._dtype, modes)
+        dc_ints = tables.rows("dc_ints")
+        for name, values in rows.items():
+            dc_ints[name][: fleet.size] = values
+        dc_ints["first_sample"][self._sparse_dcs] = LANES * sample._places.block_offsets[:-1]
+        # The racks of dense halls always write this row.
+        outlet_c = sample._memory["exhaust_odd_c"]
+        tables.arrays.update(steady_states=array, sample_outlet_c=outlet_c)
+        self._step_kernel.bind(steady_states=array, sample_outlet_c=outlet_c)
+        self._sample = sample
+
+    def _solve_sampled_racks(self, sample: Hall, conditions: Conditions) -> None:
+        """Solve the sampled racks of sparse halls, from whose outlets their sweeps start."""
+        dcs = self._sparse_dcs
+        supply_c = conditions.unit_supply_c[self._fleet.unit_offsets[dcs]]
+        sample._set_conditions(Conditions(supply_c, conditions.utilisation[dcs]))
+        sample._unit_state["fresh_ratio"][:] = 1.0
+        sample._begin_step(exchanges_before=0)
+        sample._run_sweeps(np.empty((len(DC_OUT), len(dcs))), SAMPLE_SWEEPS)
+        self._dc["feedback_gain"][dcs] = sample._dc["feedback_gain"]
+        status = sample._control["status"]
+        if np.minimum.reduce(status) == NOT_CONVERGED:
+            outlet_c = sample._memory["exhaust_odd_c"]
+            start_c = np.repeat(supply_c, LANES * sample._places.blocks).astype(self._dtype)
+            failed = np.repeat(status == NOT_CONVERGED, LANES * sample._places.blocks)
+            outlet_c[failed] = start_c[failed]
 
     def _run_sweeps(self, dc_out: F64, sweeps: int, **arguments: Any) -> None:
         """Call the kernel until every data center has converged or reached its last sweep."""

@@ -6,6 +6,7 @@ documents each array and row.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.hall.initial_guess import SteadyStateTable
 from sdc_taichi.hall.mix_weights import DENSE_RACKS
+from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.hall_arguments import (
     ARGUMENTS,
@@ -24,12 +27,11 @@ from sdc_taichi.kernels.hall_arguments import (
     DC_DOUBLES,
     DC_INTS,
     DENSE_LANES,
-    EXHAUST_PATTERNS,
     GROUP_INPUTS,
     GROUP_OUT,
     LANES,
     MIX_PATTERNS,
-    PATTERNS,
+    MODE_VECTORS,
     RACK_INPUTS,
     RACK_OUT,
     RACK_STATE,
@@ -139,18 +141,20 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     block_ints, place_ints, group_inputs = _build_groups(fleet, places, dtype)
     most_groups, group_places = block_ints[1].max(), block_ints[1].sum()
     unit_shares, mix_weights, first_mix_weight = _build_air(fleet, places, dtype)
-    steady_states, table_rows = _build_steady_states(fleet, places, dtype)
+    steady_states, guess_rows = build_steady_states(fleet, places, dtype, {})
     dc_ints = {
         "first_chunk": first_chunk,
         "first_unit": fleet.unit_offsets,
         "first_share": offsets_from_counts(places.blocks * units, "unit shares of blocks"),
         "racks": np.diff(fleet.rack_offsets),
         "first_mix_weight": first_mix_weight,
+        "first_sample": [],
     }
     rack_state = vectors(dtype, len(RACK_STATE), places.count // LANES)
+    mode_amounts = vectors(dtype, slices * MODE_VECTORS)
     arrays = {
         "task_offsets": task_offsets,
-        "dc_ints": _index_rows(DC_INTS, dc_ints | table_rows),
+        "dc_ints": _index_rows(DC_INTS, dc_ints | guess_rows),
         "chunk_ints": chunk_ints,
         "block_ints": block_ints,
         "place_ints": place_ints,
@@ -162,6 +166,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "unit_shares": unit_shares,
         "mix_weights": mix_weights,
         "steady_states": steady_states,
+        "sample_outlet_c": np.zeros(1, dtype),
         "dc_control": np.zeros((len(DC_CONTROL), fleet.size), np.int32),
         "dc_doubles": np.zeros((len(DC_DOUBLES), fleet.size)),
         "unit_state": np.ones((len(UNIT_STATE), fleet.units)),
@@ -169,6 +174,8 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "rack_state_by_4": rack_state.reshape(-1, DENSE_LANES),
         "rack_state_by_16": rack_state.reshape(-1, RUN_LANES),
         "scratch": vectors(dtype, slices * SCRATCH),
+        "mode_amounts": mode_amounts,
+        "mode_amount": mode_amounts.reshape(-1),
         "unit_need_m3s": np.zeros(max(int(chunk_ints[2, -1]), 1)),
         "chunk_sums": np.zeros(len(SUMS) * n_chunks),
         "group_values": vectors(dtype, len(GROUP_OUT), slices * int(most_groups)),
@@ -407,44 +414,80 @@ def _dense_weights(fleet: Fleet, dc: int) -> F64:
     return out * weights.norm[first:end, None]
 
 
-def _build_steady_states(
-    fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
+def build_steady_states(
+    fleet: Fleet,
+    places: RackPlaces,
+    dtype: npt.DTypeLike,
+    modes: Mapping[int, SteadyModes],
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the steady-state tables of all distinct halls, and the index rows of ``DC_INTS``.
+    """Return what gives the initial guesses of all halls, and the index rows of ``DC_INTS``.
 
-    For each hall, the array holds first its temperature patterns by block, then the table of the
-    pattern amplitudes.
+    The array holds the patterns of each distinct hall by block. A table of the amounts of the
+    patterns follows in dense halls. In sparse halls the patterns are the modes, and their amounts
+    per kelvin of each sampled rack follow.
+
+    Args:
+        fleet: The data centers.
+        places: Places of the racks in the arrays.
+        dtype: Type of the array.
+        modes: Modes of sparse halls by their index in ``HallAir.steady_states``; a hall that is
+            missing starts from its supply temperature.
     """
-    names = ("first_pattern", "first_steady_state", "supply_rows")
+    names = ("first_pattern", "first_steady_state", "supply_rows", "modes")
     air = fleet.air
     if air is None:
         return vectors(dtype, 1), dict.fromkeys(names, np.zeros(1))
-    parts: list[Array] = []
-    firsts = []
-    total = 0
+    parts: list[Array] = [np.zeros((1, LANES))]
+    index_rows = []
     first_dcs = np.unique(air.steady_state_of_dc, return_index=True)[1]
-    for table, blocks in zip(air.steady_states, places.blocks[first_dcs], strict=True):
-        patterns = np.zeros((PATTERNS, int(blocks) * LANES))
-        racks = table.patterns.shape[1]
-        is_sparse = racks > DENSE_RACKS
-        n_mix = EXHAUST_PATTERNS if is_sparse else len(table.patterns)
-        patterns[:n_mix, :racks] = table.patterns[:n_mix]
-        if is_sparse:
-            patterns[MIX_PATTERNS:, :racks] = table.patterns[n_mix:]
-        amounts = np.zeros((*table.feedback_gain.shape, LANES))
-        amounts[..., : table.pattern_shares.shape[2]] = table.pattern_shares
-        amounts[..., MIX_PATTERNS] = table.feedback_gain
-        # Cubic interpolation reads one row and column beyond the table on each side.
-        beyond = ((1, 1), (1, 1), (0, 0))
-        amounts = np.pad(amounts, beyond, mode="reflect", reflect_type="odd")
-        by_block = patterns.reshape(-1, int(blocks), LANES).swapaxes(0, 1).reshape(-1, LANES)
-        firsts.append((total, total + len(by_block), len(table.supply_c)))
-        parts += [by_block, amounts.reshape(-1, LANES)]
-        total += len(parts[-2]) + len(parts[-1])
+    total = 1
+    for entry, (table, blocks) in enumerate(
+        zip(air.steady_states, places.blocks[first_dcs], strict=True)
+    ):
+        count = supply_rows = 0
+        if isinstance(table, SteadyStateTable):
+            supply_rows = len(table.supply_c)
+            patterns = np.zeros((MIX_PATTERNS, table.patterns.shape[1]))
+            patterns[: len(table.patterns)] = table.patterns
+            parts += [_by_block(patterns, int(blocks)), _amounts_with_margin(table)]
+        elif entry in modes:
+            count = len(modes[entry].racks)
+            pairs = np.stack([modes[entry].mix_k, modes[entry].outlet_k], axis=1)
+            # Each sampled rack has a row of amounts, padded to whole vectors.
+            amounts = np.zeros((count, -(-count // LANES) * LANES))
+            amounts[:, :count] = modes[entry].amounts_per_k.T
+            parts += [
+                _by_block(pairs.reshape(2 * count, -1), int(blocks)),
+                amounts.reshape(-1, LANES),
+            ]
+        else:
+            parts += [np.zeros((0, LANES))] * 2
+        first_amount = total + len(parts[-2])
+        index_rows.append((total, first_amount, supply_rows, count))
+        total = first_amount + len(parts[-1])
     offsets_from_counts([total], "vectors of steady states")
     out = vectors(dtype, total)
     out[:] = np.concatenate(parts)
-    return out, dict(zip(names, np.array(firsts)[air.steady_state_of_dc].T, strict=True))
+    return out, dict(zip(names, np.array(index_rows)[air.steady_state_of_dc].T, strict=True))
+
+
+def _by_block(patterns: F64, blocks: int) -> Array:
+    """Return patterns over the racks, (k, R), as vectors by block, (blocks * k, LANES)."""
+    padded = np.zeros((len(patterns), blocks * LANES))
+    padded[:, : patterns.shape[1]] = patterns
+    return padded.reshape(-1, blocks, LANES).swapaxes(0, 1).reshape(-1, LANES)
+
+
+def _amounts_with_margin(table: SteadyStateTable) -> Array:
+    """Return the amounts of the patterns and the feedback gain of a table as vectors.
+
+    Cubic interpolation reads one row and column beyond the table on each side.
+    """
+    amounts = np.zeros((*table.feedback_gain.shape, LANES))
+    amounts[..., : table.pattern_shares.shape[2]] = table.pattern_shares
+    amounts[..., MIX_PATTERNS] = table.feedback_gain
+    beyond = ((1, 1), (1, 1), (0, 0))
+    return np.pad(amounts, beyond, mode="reflect", reflect_type="odd").reshape(-1, LANES)
 
 
 def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[str, Array]:
@@ -526,7 +569,13 @@ def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
     dc["return_gain"][:] = np.maximum(1.0 - RETURN_BAND_K / np.maximum(rise_k, 1e-9), 0.0)
     air = fleet.air
     if air is not None:
-        ends_c = np.array([table.supply_c[:2] for table in air.steady_states])
+        # Sparse halls have no table; any two supply temperatures do.
+        ends_c = np.array(
+            [
+                states.supply_c[:2] if isinstance(states, SteadyStateTable) else (0.0, 1.0)
+                for states in air.steady_states
+            ]
+        )
         ends_c = ends_c[air.steady_state_of_dc].T
         dc["table_low_c"][:] = ends_c[0]
         dc["table_rows_per_k"][:] = 1.0 / (ends_c[1] - ends_c[0])
