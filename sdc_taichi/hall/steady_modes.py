@@ -85,7 +85,7 @@ def extended_modes(
         outlet_k=outlet_modes,
         mix_k=np.array([mix for _, _, mix in modes], dtype=np.float64).reshape(shape),
         racks=racks,
-        amounts_per_k=np.linalg.inv(outlet_modes[:, racks].T),
+        amounts_per_k=np.asarray(np.linalg.inv(outlet_modes[:, racks].T), dtype=np.float64),
     )
 
 

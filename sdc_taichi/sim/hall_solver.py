@@ -517,10 +517,11 @@ class Hall:
         self._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
         self._dc["feedback_gain"][:] = USUAL_GAIN
         for loads in LEVELS:
-            states = self._steady_states([*dcs.values()], loads)
+            states_of_dc = self._steady_states([*dcs.values()], loads)
+            states = {entry: states_of_dc[dc] for entry, dc in dcs.items()}
             modes = {
-                entry: extended_modes(modes.get(entry), *states[dc], MODE_VECTORS * LANES)
-                for entry, dc in dcs.items()
+                entry: extended_modes(modes.get(entry), outlet_k, mix_k, MODE_VECTORS * LANES)
+                for entry, (outlet_k, mix_k) in states.items()
             }
             self._set_modes(modes, precision)
         self._step_kernel.bind(tolerance_k=TOLERANCE_K[precision])
