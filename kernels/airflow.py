@@ -7,32 +7,38 @@ column of the cell beyond each face it has -``off_diagonal``, which is at most 0
 ``through_racks``, air also passes through the racks: the air that leaves a back face carries the
 mean of the unknown over the front of its rack, times the airflow of the face.
 
-The solver of one system A x = b is the preconditioned, stabilised biconjugate gradient method (van
-der Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)). Each line names its function on the right:
+The solver is the stabilised biconjugate gradient method (van der Vorst 1992, SIAM J. Sci. Stat.
+Comput. 13(2)). It is preconditioned by K = (D + L) D^-1 (D + U), a diagonal incomplete LU
+factorisation (Pommerell 1992, dissertation, ETH Zurich) that adds most of its fill-in to the
+diagonal (Axelsson and Lindskog 1986, Numer. Math. 48(5)), which saves a third of the iterations. L
+and U are the parts of A below and above its diagonal, without the terms of racks. The iterations
+solve B y = (D + L)^-1 b, where
+B = (D + L)^-1 A (I + D^-1 U)^-1 and y = (I + D^-1 U) x. The product of B and a vector takes one
+solution with I + D^-1 U and one with D + L, and no product with A (Eisenstat 1981, SIAM J. Sci.
+Stat. Comput. 2(1)). Each line names its function on the right:
 
-    x <- 0                                                          solve_right_side
+    y <- 0                                                          solve_right_sides
     repeat, at most MOST_STARTS times:
-        r <- b - A x;  r^ <- r;  p <- r;  rho <- (r^, r)            start_iterations
-        if |r| <= tolerance |b|: done
-        repeat until |r| <= tolerance |b|, or a divisor is 0:       iterate
-            y <- K^-1 p;  v <- A y                                  precondition, multiply
-            alpha <- rho / (r^, v)
-            x <- x + alpha y;  r <- r - alpha v                     advance
-            z <- K^-1 r;  t <- A z                                  precondition, multiply
-            omega <- (t, r) / (t, t)
-            x <- x + omega z;  r <- r - omega t                     advance
+        r <- (D + L)^-1 (b - A x);  r^ <- r;  rho <- (r^, r)        start_iterations
+        if |b - A x| <= tolerance |b|: done
+        repeat until r has fallen as far as b - A x has to:         iterate
+            p <- r + beta (p - omega v);  z <- (I + D^-1 U)^-1 p
+            v <- B p = z + (D + L)^-1 (A z - (D + L) z);  alpha <- rho / (r^, v)
+            r <- r - alpha v;  z <- (I + D^-1 U)^-1 r
+            t <- B r;  omega <- (t, r) / (t, t)
+            y <- y + alpha p + omega r;  r <- r - omega t
             beta <- (r^, r) / rho * alpha / omega;  rho <- (r^, r)
-            p <- r + beta (p - omega v)                             update_search_direction
 
-K = (D + L) D^-1 (D + U) is the diagonal incomplete LU factorisation (Pommerell 1992, dissertation,
-ETH Zurich). L and U are the parts of A below and above its diagonal, without the terms of racks.
-Iterations update r instead of computing it anew, so r drifts from b - A x. The solver therefore
-restarts several times, each time from the x found so far. All starts together do at most
+Iterations update r instead of computing it anew, so r drifts from (D + L)^-1 (b - A x). The solver
+therefore restarts several times, each time from the y found so far. All starts together do at most
 ``most_iterations`` iterations.
 
-One thread solves each right side, so the number of threads does not change any bit of the result.
+Each sweep over the cells must wait for the values of the cells before. Right sides are therefore
+solved side by side, one in each lane of a vector. The lanes do not affect each other, and one
+thread solves each vector, so neither lanes nor threads change any bit of the result.
 """
 
+from dataclasses import replace
 from functools import cache
 from typing import Any, no_type_check
 
@@ -42,23 +48,28 @@ from .arguments import Argument
 from .compiler.functions import part_of
 from .compiler.named_kernel import define_kernel
 
-WORK_VECTORS = 9
-"""Work vectors of N + 1 numbers per thread."""
+LANES, FEW_LANES = 8, 2
+"""Number of right sides that are solved side by side, and number for one or two right sides."""
+WORK_VECTORS = 7
+"""Work vectors of N + 1 entries per thread; with ``through_racks`` there is one more."""
 
 (
-    _SOLUTION,  # x
+    _SOLUTION,  # y
     _RESIDUAL,  # r
     _SHADOW_RESIDUAL,  # r^
     _SEARCH_DIRECTION,  # p
-    _A_DIRECTION,  # v = A y
-    _A_CORRECTION,  # t = A z
-    _DIRECTION,  # y = K^-1 p
-    _CORRECTION,  # z = K^-1 r
-    _INVERSE_PIVOT,  # 1 / D
+    _B_DIRECTION,  # v = B p
+    _B_RESIDUAL,  # t = B r
+    _UNSCALED,  # z, and x where it is needed
 ) = range(WORK_VECTORS)
+_CARRIED = WORK_VECTORS  # what air carries from the fronts of racks to their backs
 
 MOST_STARTS = 20
 """Maximum number of starts for a right side, including the first."""
+_FILL = 0.95
+"""Share of the fill-in outside of the pattern of A that the factorisation adds to its diagonal."""
+_FALL = 0.5
+"""Fall of the residual that iterations aim at, divided by the fall that is needed."""
 
 SYSTEM_ARGUMENTS = {
     "serial": Argument("template"),  # True: run on the calling thread alone
@@ -81,7 +92,8 @@ SYSTEM_ARGUMENTS = {
     "source_cell": Argument("i32", 1),  # cell of each source
     "source": Argument("f64", 1),  # amount that each source adds to the right side
     # Work space.
-    "work": Argument("f64", 3),  # (slices, WORK_VECTORS, N + 1)
+    "work": Argument("f64", 3),  # vectors of lanes, (slices, WORK_VECTORS, N + 1)
+    "inverse_pivot": Argument("f64", 2),  # 1 / D, (slices, N + 1)
     # Results, and the return openings at which the solutions are evaluated.
     "return_cell": Argument("i32", 1),  # cell before each return face
     "return_m3s": Argument("f64", 1),  # flow out of each return face, m3/s
@@ -91,7 +103,7 @@ SYSTEM_ARGUMENTS = {
     "relative_residual": Argument("f64", 1),  # |r| / |b|, 0 where b is 0, (T,)
     "iterations": Argument("i32", 1),  # number of iterations, (T,)
 }
-"""Arguments of the kernel of ``bicgstab_kernel`` by name, template arguments first."""
+"""Arguments of the kernels of ``bicgstab_kernel`` by name, template arguments first."""
 
 
 @cache
@@ -168,12 +180,19 @@ def transport_kernel() -> Any:
 
 
 @cache
-def bicgstab_kernel() -> Any:
+def bicgstab_kernel(lanes: int) -> Any:
     """Return the kernel that solves the linear system for every right side by BiCGSTAB.
 
     The module docstring gives the algorithm. SYSTEM_ARGUMENTS lists the arguments of the kernel.
+
+    Args:
+        lanes: number of right sides that are solved side by side, at least 2.
     """
-    return define_kernel("solve_systems", SYSTEM_ARGUMENTS, run_slice, precision="f64")
+    arguments = {**SYSTEM_ARGUMENTS, "work": replace(SYSTEM_ARGUMENTS["work"], lanes=lanes)}
+    name, constants = f"solve_{lanes}_systems", {"lanes": lanes}
+    return define_kernel(
+        name, arguments, run_slice, precision="f64", lanes=lanes, constants=constants
+    )
 
 
 @ti.func
@@ -181,200 +200,292 @@ def bicgstab_kernel() -> Any:
 def run_slice(system: ti.template(), s):
     """Solve the right sides of slice ``s``, with ``work[s]`` as work space."""
     no_cell = system.diagonal.shape[0]
-    for vector in range(system.work.shape[1]):
-        system.work[s, vector, no_cell] = 0.0
+    for vector in range(WORK_VECTORS):
+        system.work[s, vector, no_cell] = system.zeros
+    if ti.static(system.through_racks):
+        for c in range(no_cell):
+            system.work[s, _CARRIED, c] = system.zeros
     factorise(system, s)
-    first, end = part_of(s, system.slices, system.relative_residual.shape[0])
-    for rhs in range(first, end):
-        solve_right_side(system, s, rhs)
-        store_results(system, s, rhs)
+    right_sides = system.relative_residual.shape[0]
+    first, end = part_of(s, system.slices, (right_sides + system.lanes - 1) // system.lanes)
+    for group in range(first, end):
+        solve_right_sides(system, s, group * system.lanes)
+        store_results(system, s, group * system.lanes)
 
 
 @ti.func
 @no_type_check
 def factorise(system: ti.template(), s):
-    """Compute 1 / D: D_c = A_cc - sum of A_cb A_bc / D_b over the lower neighbours b of cell c."""
+    """Compute 1 / D.
+
+    D_c = A_cc - sum of A_cb (A_bc + _FILL * sum of A_bk) / D_b over the lower neighbours b of cell
+    c, and over the other higher neighbours k of each b.
+    """
     cells = system.diagonal.shape[0]
     for c in range(cells):
         pivot = system.diagonal[c]
         for face in range(3):
             b = system.beyond[c, face]
             if b < cells:
-                pivot -= (
-                    system.off_diagonal[c, face]
-                    * system.off_diagonal[b, face + 3]
-                    * system.work[s, _INVERSE_PIVOT, b]
-                )
-        system.work[s, _INVERSE_PIVOT, c] = 1.0 / pivot
+                carried = (1.0 - _FILL) * system.off_diagonal[b, face + 3]
+                for upper in ti.static(range(3, 6)):
+                    carried += _FILL * system.off_diagonal[b, upper]
+                pivot -= system.off_diagonal[c, face] * carried * system.inverse_pivot[s, b]
+        system.inverse_pivot[s, c] = 1.0 / pivot
 
 
 @ti.func
 @no_type_check
-def precondition(system: ti.template(), s, vector, out):
-    """Set ``out`` to K^-1 times a work vector: solve D + L forwards, then I + D^-1 U backwards."""
+def above(system: ti.template(), s, vector, c):
+    """Return the sum of -U_cb times a work vector over the higher neighbours b of cell c."""
+    total = system.zeros
+    for face in ti.static(range(3, 6)):
+        total = (
+            total + system.off_diagonal[c, face] * (system.work[s, vector, system.beyond[c, face]])
+        )
+    return total
+
+
+@ti.func
+@no_type_check
+def unscale(system: ti.template(), s, vector):
+    """Set z to (I + D^-1 U)^-1 times a work vector."""
     cells = system.diagonal.shape[0]
-    for c in range(cells):
-        total = system.work[s, vector, c]
-        for face in ti.static(range(3)):
-            total += system.off_diagonal[c, face] * system.work[s, out, system.beyond[c, face]]
-        system.work[s, out, c] = total * system.work[s, _INVERSE_PIVOT, c]
     for i in range(cells):
         c = cells - 1 - i
-        total = ti.cast(0.0, ti.f64)
-        for face in ti.static(range(3, 6)):
-            total += system.off_diagonal[c, face] * system.work[s, out, system.beyond[c, face]]
-        system.work[s, out, c] += total * system.work[s, _INVERSE_PIVOT, c]
+        system.work[s, _UNSCALED, c] = system.work[s, vector, c] + system.inverse_pivot[
+            s, c
+        ] * above(system, s, _UNSCALED, c)
 
 
 @ti.func
 @no_type_check
-def multiply(system: ti.template(), s, vector, out):
-    """Set ``out`` to A times a work vector."""
-    for c in range(system.diagonal.shape[0]):
-        total = system.diagonal[c] * system.work[s, vector, c]
-        for face in ti.static(range(6)):
-            total -= system.off_diagonal[c, face] * system.work[s, vector, system.beyond[c, face]]
-        system.work[s, out, c] = total
+def multiplied(system: ti.template(), s, vector, out, c):
+    """Return entry c of B times a work vector, and store it in ``out``; z belongs to the vector.
+
+    All lower entries of ``out`` must have been computed. With w = (D + L)^-1 (A z - (D + L) z),
+    B p = z + w, and (D + L) w = D p + (diagonal - 2 D) z.
+    """
+    inverse_pivot = system.inverse_pivot[s, c]
+    z = system.work[s, _UNSCALED, c]
+    total = (system.diagonal[c] - 2.0 / inverse_pivot) * z
+    for face in ti.static(range(3)):
+        b = system.beyond[c, face]
+        total = total + system.off_diagonal[c, face] * (
+            system.work[s, out, b] - system.work[s, _UNSCALED, b]
+        )
     if ti.static(system.through_racks):
-        for rack in range(system.front_offsets.shape[0] - 1):
-            mean = front_mean(system, s, vector, rack)
-            for i in range(system.back_offsets[rack], system.back_offsets[rack + 1]):
-                system.work[s, out, system.back_cell[i]] -= system.back_m3s[i] * mean
+        total = total - system.work[s, _CARRIED, c]
+    product = z + system.work[s, vector, c] + inverse_pivot * total
+    system.work[s, out, c] = product
+    return product
 
 
 @ti.func
 @no_type_check
 def front_mean(system: ti.template(), s, vector, rack):
     """Return the mean of a work vector over the front of a rack, weighted by airflow."""
-    mean = ti.cast(0.0, ti.f64)
+    mean = system.zeros
     for i in range(system.front_offsets[rack], system.front_offsets[rack + 1]):
-        mean += system.front_share[i] * system.work[s, vector, system.front_cell[i]]
+        mean = mean + system.front_share[i] * system.work[s, vector, system.front_cell[i]]
     return mean
 
 
 @ti.func
 @no_type_check
-def dot(system: ti.template(), s, a, b):
-    """Return the scalar product of two work vectors."""
-    total = ti.cast(0.0, ti.f64)
-    for c in range(system.diagonal.shape[0]):
-        total += system.work[s, a, c] * system.work[s, b, c]
-    return total
+def carry_through_racks(system: ti.template(), s):
+    """Set the last work vector to what air carries from the fronts of racks to their backs."""
+    if ti.static(system.through_racks):
+        for i in range(system.back_cell.shape[0]):
+            system.work[s, _CARRIED, system.back_cell[i]] = system.zeros
+        for rack in range(system.front_offsets.shape[0] - 1):
+            mean = front_mean(system, s, _UNSCALED, rack)
+            for i in range(system.back_offsets[rack], system.back_offsets[rack + 1]):
+                c = system.back_cell[i]
+                carried = system.work[s, _CARRIED, c] + system.back_m3s[i] * mean
+                system.work[s, _CARRIED, c] = carried
 
 
 @ti.func
 @no_type_check
-def load_right_side(system: ti.template(), s, rhs, out):
-    """Set ``out`` to right side ``rhs``."""
+def load_right_sides(system: ti.template(), s, first, out):
+    """Set the lanes of ``out`` to the right sides from ``first`` on, and further lanes to 0."""
     for c in range(system.diagonal.shape[0]):
-        system.work[s, out, c] = 0.0
-    for i in range(system.source_offsets[rhs], system.source_offsets[rhs + 1]):
-        system.work[s, out, system.source_cell[i]] += system.source[i]
+        system.work[s, out, c] = system.zeros
+    for lane in ti.static(range(system.lanes)):
+        unit = ti.Vector([ti.cast(k == lane, ti.f64) for k in ti.static(range(system.lanes))])
+        if first + lane < system.relative_residual.shape[0]:
+            begin, end = (
+                system.source_offsets[first + lane],
+                system.source_offsets[first + lane + 1],
+            )
+            for i in range(begin, end):
+                c = system.source_cell[i]
+                system.work[s, out, c] = system.work[s, out, c] + system.source[i] * unit
 
 
 @ti.func
 @no_type_check
-def solve_right_side(system: ti.template(), s, rhs):
-    """Solve for right side ``rhs``; store the number of iterations and the relative residual."""
-    for c in range(system.diagonal.shape[0]):
-        system.work[s, _SOLUTION, c] = 0.0
-    load_right_side(system, s, rhs, _RESIDUAL)
-    goal = system.tolerance * ti.sqrt(dot(system, s, _RESIDUAL, _RESIDUAL))
-    residual_norm = ti.cast(0.0, ti.f64)
-    iterations, starts, ends = 0, 0, False
+def solve_right_sides(system: ti.template(), s, first):
+    """Solve for the right sides from ``first`` on; store iterations and relative residuals."""
+    cells = system.diagonal.shape[0]
+    load_right_sides(system, s, first, _RESIDUAL)
+    square = system.zeros
+    for c in range(cells):
+        square = square + system.work[s, _RESIDUAL, c] * system.work[s, _RESIDUAL, c]
+        system.work[s, _SOLUTION, c] = system.zeros
+    goal = system.tolerance * ti.sqrt(square)
+    most_iterations = system.zeros + ti.cast(system.most_iterations, ti.f64)
+    iterations = system.zeros
+    residual_norm = system.zeros
+    starts, ends = 0, False
     while starts < MOST_STARTS and not ends:
         starts += 1
-        rho = start_iterations(system, s, rhs)
-        residual_norm = ti.sqrt(rho)
-        ends = residual_norm <= goal or iterations >= system.most_iterations
+        rho, residual_norm = start_iterations(system, s, first)
+        zeros, ones = system.zeros, system.zeros + 1.0
+        unsolved = ti.select(residual_norm > goal, ones, zeros)
+        unsolved = ti.select(iterations < most_iterations, unsolved, zeros)
+        ends = unsolved.sum() == 0.0
         if not ends:
-            residual_norm, iterations = iterate(system, s, rho, goal, iterations)
-    system.relative_residual[rhs] = 0.0
-    if goal > 0.0:
-        system.relative_residual[rhs] = system.tolerance * residual_norm / goal
-    system.iterations[rhs] = iterations
+            fall = _FALL * quotient(goal, residual_norm)
+            iterations = iterate(system, s, rho, fall * ti.sqrt(rho), unsolved, iterations)
+    for lane in ti.static(range(system.lanes)):
+        if first + lane < system.relative_residual.shape[0]:
+            residual = ti.cast(0.0, ti.f64)
+            if goal[lane] > 0.0:
+                residual = system.tolerance * residual_norm[lane] / goal[lane]
+            system.relative_residual[first + lane] = residual
+            system.iterations[first + lane] = ti.cast(iterations[lane], ti.i32)
 
 
 @ti.func
 @no_type_check
-def start_iterations(system: ti.template(), s, rhs):
-    """Set r, r^ and p to b - A x, and return rho."""
-    load_right_side(system, s, rhs, _RESIDUAL)
-    multiply(system, s, _SOLUTION, _A_DIRECTION)
+def start_iterations(system: ti.template(), s, first):
+    """Set r and r^ to (D + L)^-1 (b - A x), and p and v to 0; return rho and |b - A x|."""
+    load_right_sides(system, s, first, _RESIDUAL)
+    unscale(system, s, _SOLUTION)
+    carry_through_racks(system, s)
+    square, rho = system.zeros, system.zeros
     for c in range(system.diagonal.shape[0]):
-        residual = system.work[s, _RESIDUAL, c] - system.work[s, _A_DIRECTION, c]
+        residual = (
+            system.work[s, _RESIDUAL, c]
+            - system.diagonal[c] * system.work[s, _UNSCALED, c]
+            + above(system, s, _UNSCALED, c)
+        )
+        if ti.static(system.through_racks):
+            residual = residual + system.work[s, _CARRIED, c]
+        for face in ti.static(range(3)):
+            residual = (
+                residual
+                + system.off_diagonal[c, face] * (system.work[s, _UNSCALED, system.beyond[c, face]])
+            )
+        square = square + residual * residual
+        for face in ti.static(range(3)):
+            residual = (
+                residual
+                + system.off_diagonal[c, face] * (system.work[s, _RESIDUAL, system.beyond[c, face]])
+            )
+        residual = residual * system.inverse_pivot[s, c]
+        rho = rho + residual * residual
         system.work[s, _RESIDUAL, c] = residual
         system.work[s, _SHADOW_RESIDUAL, c] = residual
-        system.work[s, _SEARCH_DIRECTION, c] = residual
-    return dot(system, s, _RESIDUAL, _RESIDUAL)
+        system.work[s, _SEARCH_DIRECTION, c] = system.zeros
+        system.work[s, _B_DIRECTION, c] = system.zeros
+    return rho, ti.sqrt(square)
 
 
 @ti.func
 @no_type_check
-def iterate(system: ti.template(), s, rho_at_start, goal, iterations_before):
-    """Iterate until |r| reaches the goal, iterations are used up, or a divisor is 0.
+def quotient(a, b):
+    """Return a / b, and 0 where b is 0."""
+    zeros = b * 0.0
+    return ti.select(b == zeros, zeros, a / ti.select(b == zeros, zeros + 1.0, b))
+
+
+@ti.func
+@no_type_check
+def iterate(system: ti.template(), s, rho_at_start, goal, unsolved, iterations_before):
+    """Iterate until |r| of each unsolved lane reaches its goal, or a divisor is 0.
+
+    Lanes that have ended do not change any more.
 
     Returns:
-        |r|, and the number of iterations since the first start.
+        The number of iterations of each lane since the first start.
     """
-    rho, iterations = rho_at_start, iterations_before
-    residual_norm = ti.sqrt(rho)
-    ends = False
-    while not ends:
-        iterations += 1
-        precondition(system, s, _SEARCH_DIRECTION, _DIRECTION)
-        multiply(system, s, _DIRECTION, _A_DIRECTION)
-        shadow_product = dot(system, s, _SHADOW_RESIDUAL, _A_DIRECTION)
-        if shadow_product == 0.0:
-            break
-        alpha = rho / shadow_product
-        advance(system, s, alpha, _DIRECTION, _A_DIRECTION)
-        precondition(system, s, _RESIDUAL, _CORRECTION)
-        multiply(system, s, _CORRECTION, _A_CORRECTION)
-        correction_square = dot(system, s, _A_CORRECTION, _A_CORRECTION)
-        if correction_square == 0.0:
-            break
-        omega = dot(system, s, _A_CORRECTION, _RESIDUAL) / correction_square
-        advance(system, s, omega, _CORRECTION, _A_CORRECTION)
-        next_rho = dot(system, s, _SHADOW_RESIDUAL, _RESIDUAL)
-        residual_norm = ti.sqrt(dot(system, s, _RESIDUAL, _RESIDUAL))
-        ends = residual_norm <= goal or iterations >= system.most_iterations
-        ends = ends or omega == 0.0 or rho == 0.0
-        if not ends:
-            update_search_direction(system, s, next_rho / rho * alpha / omega, omega)
-            rho = next_rho
-    return residual_norm, iterations
+    cells = system.diagonal.shape[0]
+    most_iterations = system.zeros + ti.cast(system.most_iterations, ti.f64)
+    rho, iterations, runs = rho_at_start, iterations_before, unsolved
+    beta, omega = system.zeros, system.zeros
+    running = runs.sum()
+    while running > 0.0:
+        iterations = iterations + runs
+        for i in range(cells):
+            c = cells - 1 - i
+            direction = system.work[s, _RESIDUAL, c] + beta * (
+                system.work[s, _SEARCH_DIRECTION, c] - omega * system.work[s, _B_DIRECTION, c]
+            )
+            system.work[s, _SEARCH_DIRECTION, c] = direction
+            system.work[s, _UNSCALED, c] = direction + system.inverse_pivot[s, c] * above(
+                system, s, _UNSCALED, c
+            )
+        carry_through_racks(system, s)
+        shadow_product = system.zeros
+        for c in range(cells):
+            v = multiplied(system, s, _SEARCH_DIRECTION, _B_DIRECTION, c)
+            shadow_product = shadow_product + system.work[s, _SHADOW_RESIDUAL, c] * v
+        alpha = runs * quotient(rho, shadow_product)
+        for i in range(cells):
+            c = cells - 1 - i
+            residual = system.work[s, _RESIDUAL, c] - alpha * system.work[s, _B_DIRECTION, c]
+            system.work[s, _RESIDUAL, c] = residual
+            system.work[s, _UNSCALED, c] = residual + system.inverse_pivot[s, c] * above(
+                system, s, _UNSCALED, c
+            )
+        carry_through_racks(system, s)
+        square, product = system.zeros, system.zeros
+        for c in range(cells):
+            t = multiplied(system, s, _RESIDUAL, _B_RESIDUAL, c)
+            square = square + t * t
+            product = product + t * system.work[s, _RESIDUAL, c]
+        omega = runs * quotient(product, square)
+        next_rho, residual_square = system.zeros, system.zeros
+        for c in range(cells):
+            residual = system.work[s, _RESIDUAL, c]
+            system.work[s, _SOLUTION, c] = (
+                system.work[s, _SOLUTION, c]
+                + alpha * system.work[s, _SEARCH_DIRECTION, c]
+                + omega * residual
+            )
+            residual = residual - omega * system.work[s, _B_RESIDUAL, c]
+            system.work[s, _RESIDUAL, c] = residual
+            next_rho = next_rho + system.work[s, _SHADOW_RESIDUAL, c] * residual
+            residual_square = residual_square + residual * residual
+        runs = ti.select(ti.sqrt(residual_square) > goal, runs, system.zeros)
+        runs = ti.select(iterations < most_iterations, runs, system.zeros)
+        runs = ti.select(omega * next_rho == system.zeros, system.zeros, runs)
+        beta = runs * quotient(next_rho, rho) * quotient(alpha, omega)
+        rho = next_rho
+        running = runs.sum()
+    return iterations
 
 
 @ti.func
 @no_type_check
-def advance(system: ti.template(), s, step, direction, a_direction):
-    """Add ``step`` times ``direction`` to x, and subtract A times this change from r."""
-    for c in range(system.diagonal.shape[0]):
-        system.work[s, _SOLUTION, c] += step * system.work[s, direction, c]
-        system.work[s, _RESIDUAL, c] -= step * system.work[s, a_direction, c]
-
-
-@ti.func
-@no_type_check
-def update_search_direction(system: ti.template(), s, beta, omega):
-    """Set p to r + beta (p - omega v)."""
-    for c in range(system.diagonal.shape[0]):
-        system.work[s, _SEARCH_DIRECTION, c] = system.work[s, _RESIDUAL, c] + beta * (
-            system.work[s, _SEARCH_DIRECTION, c] - omega * system.work[s, _A_DIRECTION, c]
-        )
-
-
-@ti.func
-@no_type_check
-def store_results(system: ti.template(), s, rhs):
-    """Store rack intakes, returned flow, and the first solution, for right side ``rhs``."""
+def store_results(system: ti.template(), s, first):
+    """Store rack intakes, returned flow, and the first solution, for right sides from ``first``."""
+    unscale(system, s, _SOLUTION)
+    right_sides = system.relative_residual.shape[0]
     for rack in range(system.front_offsets.shape[0] - 1):
-        system.intake[rack, rhs] = front_mean(system, s, _SOLUTION, rack)
-    total = ti.cast(0.0, ti.f64)
+        mean = front_mean(system, s, _UNSCALED, rack)
+        for lane in ti.static(range(system.lanes)):
+            if first + lane < right_sides:
+                system.intake[rack, first + lane] = mean[lane]
+    total = system.zeros
     for i in range(system.return_cell.shape[0]):
-        total += system.return_m3s[i] * system.work[s, _SOLUTION, system.return_cell[i]]
-    system.returned[rhs] = total
-    if rhs == 0:
+        total = total + system.return_m3s[i] * system.work[s, _UNSCALED, system.return_cell[i]]
+    for lane in ti.static(range(system.lanes)):
+        if first + lane < right_sides:
+            system.returned[first + lane] = total[lane]
+    if first == 0:
         for c in range(system.diagonal.shape[0] + 1):
-            system.first_solution[c] = system.work[s, _SOLUTION, c]
+            system.first_solution[c] = system.work[s, _UNSCALED, c][0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from itertools import pairwise
 from typing import Any
 
@@ -9,11 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from sdc_taichi import DataCenterConfig, load_config
+from sdc_taichi.cli import hall as hall_commands
+from sdc_taichi.cli.app import app
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.hall.rack_servers import air_properties
+from sdc_taichi.kernels import airflow as kernels
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver import solve as airflow
 from sdc_taichi.layout_solver.grid import MOST_CELLS, Grid, build_grid
@@ -227,6 +233,38 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     second = solved(config)
     assert first.R.tobytes() == second.R.tobytes()
     assert first.provenance == second.provenance
+
+
+def test_lanes_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = hall_of(2, 5)
+    first = solved(config)
+    monkeypatch.setattr(kernels, "LANES", 4)
+    assert solved(config).R.tobytes() == first.R.tobytes()
+
+
+def test_progress_begins_with_an_estimate_and_ends_with_the_last_tag() -> None:
+    told: list[tuple[int, int, float]] = []
+
+    def tell(done: int, total: int, expected_s: float) -> None:
+        told.append((done, total, expected_s))
+
+    for config in (hall_of(2, 10), hall_of(4, 10)):
+        solve_at_design_point(config, 0.6, tell)
+    ends = [i for i, (done, total, _) in enumerate(told) if done == total]
+    assert ends == [ends[0], len(told) - 1]
+    assert [told[0][:2], told[ends[0] + 1][:2]] == [(0, 21), (0, 41)]
+    done = [each[0] for each in told[: ends[0] + 1]]
+    assert done == sorted(set(done))
+    # Twice the racks and about twice the cells take up to four times as long.
+    assert 2.0 < told[-1][2] / told[0][2] < 5.0
+
+
+def test_command_says_how_long_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hall_commands, "LEAST_TOLD_S", 0.0)
+    done = CliRunner().invoke(app, ["hall", "solve", "--cell", "0.9", "--json"])
+    assert done.exit_code == 0, done.output
+    assert re.search(r"^about \d+:\d\d of computing for 21 tags$", done.stderr, re.MULTILINE)
+    assert json.loads(done.stdout)["share_residual"] < 1e-10
 
 
 def test_default_hall_is_converged_in_the_grid() -> None:

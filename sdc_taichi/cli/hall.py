@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sys
+import time
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -22,7 +26,7 @@ from sdc_taichi.cli.options import (
     json_option,
     out_option,
 )
-from sdc_taichi.cli.terminal import count_text
+from sdc_taichi.cli.terminal import ProgressLines, count_text, duration, stage_bars
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
 from sdc_taichi.hall.air_metrics import rank
@@ -30,9 +34,12 @@ from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:
-    from sdc_taichi.layout_solver.solve import LayoutSolution
+    from sdc_taichi.layout_solver.solve import LayoutSolution, SolverProgress
     from sdc_taichi.run.failover import Failover
     from sdc_taichi.sim.design_hall import DesignHall
+
+LEAST_TOLD_S = 5.0
+"""Shortest expected time of a solution, in s, that ``hall solve`` announces."""
 
 hall_app = CommandApp(help="Describe a hall, solve its air.", no_args_is_help=True)
 hall_app.command("why", may_allow_code=True)(why_command)
@@ -87,7 +94,8 @@ def solve_hall(
 
     check_out_file(out, ".npz", force=force)
     center, _ = config.read()
-    solution = solve_at_design_point(center, cell)
+    with _solver_progress() as progress:
+        solution = solve_at_design_point(center, cell, progress)
     if out is not None:
         provenance = np.array(json.dumps(solution.provenance, sort_keys=True))
         with atomic_write(out, parents=True) as file:
@@ -98,6 +106,25 @@ def solve_hall(
     _print_layout_solution(center, solution)
     if out is not None:
         typer.echo(f"Matrix: {printable(out)} (for hall.recirculation.matrix_file)")
+
+
+@contextlib.contextmanager
+def _solver_progress() -> Iterator[SolverProgress]:
+    """Print how long the layout solver will take, and show its progress on stderr."""
+    lines, is_terminal = ProgressLines(), sys.stderr.isatty()
+    start_s = time.monotonic()
+    with stage_bars(shown=True) as bars:
+
+        def show(done: int, total: int, expected_s: float) -> None:
+            if done == 0 and expected_s >= LEAST_TOLD_S:
+                text = f"about {duration(expected_s)} of computing for {total:,} tags"
+                print(text, file=sys.stderr, flush=True)
+            elif not is_terminal and done < total and expected_s >= LEAST_TOLD_S:
+                passed = duration(time.monotonic() - start_s)
+                lines.print(f"{done:,} of {total:,} tags after {passed}", always=False)
+            bars("air flow", done, total)
+
+        yield show
 
 
 def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:

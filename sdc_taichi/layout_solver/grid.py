@@ -17,7 +17,7 @@ from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
 from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000
-"""Largest number of cells of a grid, solid cells included; it needs about 2 GB on two threads."""
+"""Largest number of cells of a grid, solid cells included; it needs about 4 GB on two threads."""
 CELL_RANGE_M = (0.05, 2.0)
 """Smallest and largest valid cell length, in m."""
 DEFAULT_CELL_M = 0.3

@@ -10,7 +10,7 @@ import hashlib
 import time
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
 from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.kernels.compiler.arrays import aligned
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.types import F64, I32
 
@@ -30,10 +31,27 @@ MIXING_M = 0.3
 cells of less than 0.6 m the numerical diffusion of upwind differences is smaller than this, so
 results do not depend on the cell length."""
 
+_TAG_CELL_S, _CELL_S = 7e-7, 5e-5
+"""Computing time of one thread for one tag, and of all other systems, in s per cell, on a server
+processor of 2023."""
+
 _TOLERANCE = 1e-13
 """Tolerance of linear systems: norm of the residual divided by that of the right-hand side."""
 _MOST_ITERATIONS = 20_000
 """Largest number of iterations for one linear system."""
+
+
+class SolverProgress(Protocol):
+    """Callback ``(done, total, expected_s)`` of the layout solver."""
+
+    def __call__(self, done: int, total: int, expected_s: float) -> None:
+        """Show the progress.
+
+        Args:
+            done: Number of solved tags; 0 before the first system.
+            total: Number of all tags.
+            expected_s: Expected computing time of the whole solution, in s.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +103,7 @@ def solve(
     supply_m3s: float,
     supply_c: float,
     cell_m: float = DEFAULT_CELL_M,
+    progress: SolverProgress | None = None,
 ) -> LayoutSolution:
     """Solve the airflow and the temperatures of a hall.
 
@@ -101,6 +120,7 @@ def solve(
         supply_m3s: Total airflow of the CRAC units, m3/s.
         supply_c: Supply air temperature, C.
         cell_m: Largest cell length, m.
+        progress: Callback, called before the first system and after each part of the tags.
 
     Raises:
         ConfigError: The cell length is out of range, or there are too many cells or racks.
@@ -114,7 +134,7 @@ def solve(
             f"{MOST_MATRIX_RACKS:,}, the largest matrix that a hall can use"
         )
     grid = build_grid(hall, airflow_m3s, supply_m3s, cell_m)
-    air = _GridAir(grid, airflow_m3s)
+    air = _GridAir(grid, airflow_m3s, progress)
     mass_residual = air.find_flow() / supply_m3s
     R, supply_share, returned_m3s = air.exhaust_shares()
 
@@ -183,9 +203,10 @@ class _GridAir:
     Args:
         grid: Grid with the flows through its boundaries.
         airflow_m3s: Airflow of each rack, m3/s, (R,).
+        progress: Callback; None shows nothing.
     """
 
-    def __init__(self, grid: Grid, airflow_m3s: F64) -> None:
+    def __init__(self, grid: Grid, airflow_m3s: F64, progress: SolverProgress | None) -> None:
         self._threads = runtime.ensure_started()
         from sdc_taichi.kernels import airflow
         from sdc_taichi.kernels.compiler.launch import run_once
@@ -193,11 +214,21 @@ class _GridAir:
         self._kernels, self._run = airflow, run_once
         self._grid = grid
         self._racks = len(airflow_m3s)
+        slices = min(self._threads, self._racks // airflow.LANES + 1)
+        tags_s = _TAG_CELL_S * (self._racks + 1) / slices
+        self._expected_s = grid.cells * (tags_s + _CELL_S)
+        self._progress = progress
+        self._tell(0)
         fronts = grid.fronts
         self._front_share = fronts.m3s / np.repeat(airflow_m3s, np.diff(fronts.face_offsets))
         # Coefficients of the transport of tags, see ``kernels.airflow``.
         self._off_diagonal = np.zeros_like(grid.conductance_m)
         self._diagonal = np.zeros(grid.cells)
+
+    def _tell(self, done: int) -> None:
+        """Call the progress callback with the number of solved tags."""
+        if self._progress is not None:
+            self._progress(done, self._racks + 1, self._expected_s)
 
     def find_flow(self) -> float:
         """Solve the flow potential and compute the transport coefficients of the tags.
@@ -299,7 +330,11 @@ class _GridAir:
         """
         grid, kernels = self._grid, self._kernels
         right_sides = len(source_offsets) - 1
-        slices = min(self._threads, right_sides)
+        lanes = kernels.LANES if right_sides > kernels.FEW_LANES else kernels.FEW_LANES
+        slices = min(self._threads, -(-right_sides // lanes))
+        vectors = kernels.WORK_VECTORS + through_racks
+        work = aligned((slices, vectors, grid.cells + 1, lanes), np.float64)
+        inverse_pivot = np.empty((slices, grid.cells + 1))
         solution = _SystemSolution(
             first_solution=np.empty(grid.cells + 1),
             intake=np.empty((self._racks, right_sides)),
@@ -307,34 +342,42 @@ class _GridAir:
             relative_residual=np.empty(right_sides),
             iterations=np.empty(right_sides, np.int32),
         )
-        self._run(
-            kernels.bicgstab_kernel(),
-            serial=False,
-            through_racks=through_racks,
-            slices=slices,
-            most_iterations=_MOST_ITERATIONS,
-            tolerance=_TOLERANCE,
-            beyond=grid.beyond,
-            off_diagonal=off_diagonal,
-            diagonal=diagonal,
-            front_offsets=grid.fronts.face_offsets,
-            front_cell=grid.fronts.cell,
-            front_share=self._front_share,
-            back_offsets=grid.backs.face_offsets,
-            back_cell=grid.backs.cell,
-            back_m3s=grid.backs.m3s,
-            source_offsets=source_offsets,
-            source_cell=source_cell,
-            source=source,
-            work=np.empty((slices, kernels.WORK_VECTORS, grid.cells + 1)),
-            return_cell=grid.return_cell,
-            return_m3s=grid.return_m3s,
-            first_solution=solution.first_solution,
-            intake=solution.intake,
-            returned=solution.returned,
-            relative_residual=solution.relative_residual,
-            iterations=solution.iterations,
-        )
+        # One vector of right-hand sides for each thread at a time, to show the progress.
+        for first in range(0, right_sides, slices * lanes):
+            part = slice(first, min(first + slices * lanes, right_sides))
+            intake = np.empty((self._racks, part.stop - first))
+            self._run(
+                kernels.bicgstab_kernel(lanes),
+                serial=False,
+                through_racks=through_racks,
+                slices=slices,
+                most_iterations=_MOST_ITERATIONS,
+                tolerance=_TOLERANCE,
+                beyond=grid.beyond,
+                off_diagonal=off_diagonal,
+                diagonal=diagonal,
+                front_offsets=grid.fronts.face_offsets,
+                front_cell=grid.fronts.cell,
+                front_share=self._front_share,
+                back_offsets=grid.backs.face_offsets,
+                back_cell=grid.backs.cell,
+                back_m3s=grid.backs.m3s,
+                source_offsets=source_offsets[first : part.stop + 1],
+                source_cell=source_cell,
+                source=source,
+                work=work,
+                inverse_pivot=inverse_pivot,
+                return_cell=grid.return_cell,
+                return_m3s=grid.return_m3s,
+                first_solution=solution.first_solution,
+                intake=intake,
+                returned=solution.returned[part],
+                relative_residual=solution.relative_residual[part],
+                iterations=solution.iterations[part],
+            )
+            solution.intake[:, part] = intake
+            if right_sides > 1:
+                self._tell(part.stop)
         residual, iterations = solution.relative_residual, solution.iterations
         worst = int(np.argmax(np.where(np.isfinite(residual), residual, np.inf)))
         if not residual[worst] <= 100 * _TOLERANCE:
@@ -366,13 +409,16 @@ class _SystemSolution:
 
 
 def solve_at_design_point(
-    config: DataCenterConfig, cell_m: float = DEFAULT_CELL_M
+    config: DataCenterConfig,
+    cell_m: float = DEFAULT_CELL_M,
+    progress: SolverProgress | None = None,
 ) -> LayoutSolution:
     """Solve airflow and temperatures of a hall at full load and design supply temperature.
 
     Args:
         config: The data center.
         cell_m: Largest cell length, m.
+        progress: Callback, see ``solve``.
 
     Raises:
         ConfigError: The outlet model is not ``server``, the cell length is out of range, or there
@@ -396,6 +442,7 @@ def solve_at_design_point(
         supply_m3s=design.crac_flow_m3s,
         supply_c=design.supply_c,
         cell_m=cell_m,
+        progress=progress,
     )
 
 
