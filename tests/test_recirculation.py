@@ -39,11 +39,16 @@ from sdc_taichi import (
     PhysicalLimitError,
     RuntimeStateError,
     SdcError,
+    Simulator,
     build_fleet,
     load_config,
 )
 from sdc_taichi.config import config_from_dict
+from sdc_taichi.hall.mix_weights import layout_weights
 from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.hall.steady_modes import extended_modes
+from sdc_taichi.kernels.arguments import row_index
+from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
 from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
@@ -98,6 +103,66 @@ def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
     # Setpoints move by whole kelvins, where the table has its entries.
     hall.solve(Conditions(rng.integers(16, 24, 300).astype(float), rng.integers(0, 161, 300) / 160))
     assert hall.sweeps.mean() < 1.3
+
+
+@pytest.mark.parametrize(("preset", "most"), [("large", 1.4), ("hall_of_2026", 1.8)])
+def test_sampled_racks_start_the_sweeps_of_large_halls(preset: str, most: float) -> None:
+    config = load_config(preset)
+    fleet, rng, setpoint = (
+        build_fleet([config] * 40),
+        np.random.default_rng(0),
+        config.hvac.setpoint,
+    )
+    hall = Hall(fleet, "f32")
+    supply_c = rng.uniform(setpoint.min_c, setpoint.max_c, 40)[fleet.unit_dc]
+    hall.solve(Conditions(supply_c, rng.uniform(0.1, 1.0, 40)))
+    assert hall.sweeps.mean() < most
+
+
+def test_modes_of_the_worked_example() -> None:
+    outlet_k = np.array([[8.0, 10.0, 6.0], [8.0, 9.0, 5.0]])
+    modes = extended_modes(None, outlet_k, 0.5 * outlet_k, most=3)
+    assert modes.racks.tolist() == [1, 0]
+    assert modes.outlet_k == pytest.approx(np.array([[0.8, 1.0, 0.6], [1.0, 0.0, -0.5]]))
+    # Any other sum of both states follows from the outlets of racks 1 and 0.
+    state = 0.3 * outlet_k[0] + 1.2 * outlet_k[1]
+    amounts = modes.amounts_per_k @ state[modes.racks]
+    assert amounts @ modes.outlet_k == pytest.approx(state)
+    assert amounts @ modes.mix_k == pytest.approx(0.5 * state)
+    # A state between them adds no mode, a third one does.
+    assert len(extended_modes(modes, state[None], 0.5 * state[None], most=3).racks) == 2
+    assert len(extended_modes(modes, np.eye(3), np.eye(3), most=3).racks) == 3
+
+
+def test_runs_that_share_their_weights_are_summed_together() -> None:
+    weights = layout_weights(load_config("large").hall)
+    values = np.random.default_rng(0).normal(size=1000)
+    assert weights.apply(values) == pytest.approx(weights.dense() @ values, abs=1e-13)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_units_that_approach_steady_air_slowly_are_extrapolated(precision: Precision) -> None:
+    # Units 3 to 5 are at the limit of their coils: each sweep changes their supply air by 0.985 of
+    # the change before.
+    fleet = fleet_of(load_config("hall_of_2026"))
+    hall = Hall(fleet, precision)
+    speed = np.array([0.647, 0.31, 0.454, 0.939, 0.886, 0.957])
+    supply_c = np.array([18.7326, 20.6355, 18.1213, 26.5123, 20.739, 21.9697])
+    sums = hall.solve(Conditions(supply_c, np.array([0.9943]), unit_low=speed, unit_high=speed))
+    assert hall.sweeps[0] < {"f32": 100, "f64": 400}[precision]
+    # All power of the servers leaves with the air.
+    it_w = sums.cpu_w + sums.it_fan_w
+    air_w = sums.outlet_m3k_s - sums.inlet_m3k_s
+    air_w *= fleet.dcs[row_index(DC_COEFFICIENTS, "air_j_per_m3_k")]
+    assert air_w == pytest.approx(it_w, rel=10 * TOLERANCE[precision])
+
+
+@pytest.mark.parametrize("design_supply_c", [18.0, 18.01, 18.05, 18.1])
+def test_units_that_just_cover_the_need_have_steady_air(design_supply_c: float) -> None:
+    config = load_config("hall_of_2026", [f"hall.design_supply_c={design_supply_c}"])
+    with Simulator(config, precision="f64") as sim:
+        sim.reset()
+        assert sim.step().inlet_max_c[0] < 30.0
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
