@@ -225,6 +225,22 @@ def planned(quick: bool) -> Iterator[Figure]:
         yield Figure("planned", where, ratio, at_most=at_most, absolute=beside)
 
 
+def halls(quick: bool) -> Iterator[Figure]:
+    """Sweeps of the halls of the presets in runs, and a step of 100,000 racks over the roof."""
+    for preset in ("corrected", "large", "hall_of_2026"):
+        sweeps = steps.sweeps_of_run(preset, 2 if quick else 96)
+        note = ", ".join(f"{100 * np.mean(sweeps == n):.0f} % {n}" for n in np.unique(sweeps))
+        mean = float(sweeps.mean())
+        yield Figure("halls", f"{preset}: sweeps of a step", mean, "sweeps", 2.0, note=note)
+    sim = sdc_taichi.Simulator(sdc_taichi.load_config("large", steps.side_of(12 if quick else 320)))
+    sim.reset()
+    roof = plain_store(sim.fleet.servers)
+    ratio = core_ratios({"step": sim.step}, roof, 1 if quick else 40)["step"]
+    beside = f"{number(1e3 * wall_s(sim.step, 1 if quick else 10))} ms/step"
+    name = f"{sim.fleet.racks:,} racks, over the memory roof"
+    yield Figure("halls", name, ratio, at_most=2.0, absolute=beside)
+
+
 def calls(quick: bool) -> Iterator[Figure]:
     """Number of calls of a step, which should be small and not depend on the batch."""
     many = 8 if quick else 96
@@ -303,11 +319,12 @@ def wall_s(call: Callable[[], object], repeats: int) -> float:
 
 def starting(quick: bool) -> Iterator[Figure]:
     """Import, init and first step in a new process, with an empty and a filled kernel cache."""
-    for what in ("simulator",) if quick else ("simulator", "environment"):
+    cases = {"simulator": 12.0, "environment": 12.0, "100,000 racks": 60.0}
+    for what, warm_at_most in [*cases.items()][: 1 if quick else None]:
         with tempfile.TemporaryDirectory() as cache:
             # Bytecode is kept, as of an installed package, whatever the shell says.
             around = {"TI_OFFLINE_CACHE_FILE_PATH": cache, "PYTHONDONTWRITEBYTECODE": ""}
-            for state, at_most in (("cold", 30.0), ("warm", 12.0)):
+            for state, at_most in (("cold", warm_at_most + 18.0), ("warm", warm_at_most)):
                 ratios, spent_s = [], []
                 for _ in range(1 if quick or state == "cold" else 5):
                     begin = time.time()
@@ -484,8 +501,8 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    parts = environments, planned, kernel_and_peer, calls, scaling, starting, optima, recording
-    for part in parts:
+    parts = environments, planned, kernel_and_peer, halls, calls, scaling, starting, optima
+    for part in (*parts, recording):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

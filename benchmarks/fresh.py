@@ -29,6 +29,9 @@ def yardstick_s() -> float:
 def first_step(what: str) -> dict[str, float]:
     """When the first step of one data center, or of its environment, ended, and what it took.
 
+    Args:
+        what: ``simulator`` or ``environment`` of one data center, or ``100,000 racks``.
+
     Returns:
         Time of day at the end, core time of the process until then and that of the interpreter
         yardstick right after it, all in s.
@@ -38,7 +41,9 @@ def first_step(what: str) -> dict[str, float]:
         one.reset(seed=0)
         one.step(dict.fromkeys(one.possible_agents, 1))
     else:
-        sim = sdc_taichi.Simulator(sdc_taichi.load_config("corrected"))
+        large = what == "100,000 racks"
+        config = ("large", steps.side_of(320)) if large else ("corrected",)
+        sim = sdc_taichi.Simulator(sdc_taichi.load_config(*config))
         sim.reset()
         sim.step()
     end_s, spent_s = time.time(), time.process_time()

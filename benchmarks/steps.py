@@ -13,7 +13,7 @@ from sdc_taichi.control import view_maker
 from sdc_taichi.kernels.compiler.launch import BoundKernel
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
-from sdc_taichi.types import StepResult
+from sdc_taichi.types import I32, StepResult
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
 """Sites with a synthetic year."""
@@ -45,6 +45,27 @@ def single_step(config: sdc_taichi.DataCenterConfig) -> Callable[[], object]:
         one.step(actions)
 
     return step
+
+
+def side_of(racks: int) -> list[str]:
+    """Overrides of a hall with that many rows of as many racks."""
+    return [f"hall.rows={racks}", f"hall.racks_per_row={racks}"]
+
+
+def sweeps_of_run(preset: str, count: int) -> I32:
+    """Sweeps of each step of a run of ``count`` steps at eight sites, (steps, sites).
+
+    The setpoint changes every other hour by a random step.
+    """
+    configs = sdc_taichi.make_configs(sdc_taichi.load_config(preset), count=8, sites=SITES)
+    rng, sweeps = np.random.default_rng(0), []
+    with sdc_taichi.Simulator(configs) as sim:
+        sim.reset()
+        for step in range(count):
+            cooling = rng.integers(-1, 2, sim.size) if step % 8 == 0 else 0.0
+            sim.step(sdc_taichi.Actions(load=0.0, cooling=cooling, battery=0.0))
+            sweeps.append(sim.sweeps)
+    return np.array(sweeps, dtype=np.int32)
 
 
 @contextlib.contextmanager

@@ -283,10 +283,10 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
             load_w += units.fan_m3s * dc.crac_fan_w_per_m3s
             moved_k = ti.max(moved_k, set_supply(hall, n, units, air.units_return_c, 0.0, load_w))
         dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, moved_k, is_last)
-        if dc.status == RUNNING:
+        if dc.status == RUNNING and dc.inlet_target_c == 0.0:
             outlet_c = total.outlet_sum_c / ti.cast(dc.racks, ti.f64)
             extrapolate_units(hall, n, ti.abs(outlet_c - air.supply_c))
-        elif dc.adjusts_supply > 0.0:
+        if dc.adjusts_supply > 0.0 and dc.status != RUNNING:
             keep_supply(hall, n)
         if dc.first_mix_weight < 0:
             dc.exchanges_before = ti.cast(exchanges, ti.i32)

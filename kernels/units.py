@@ -283,7 +283,8 @@ def extrapolate_units(hall: ti.template(), n, above_k):
     Warmer servers draw more air, of which units at full speed cover a smaller share, and coils at
     their limit supply warmer air, so servers become still warmer. Then each sweep changes both by
     a factor just below 1 times the change before, and the remaining changes sum up to that factor
-    divided by 1 minus the factor, times the present change (Aitken 1926).
+    divided by 1 minus the factor, times the present change (Aitken 1926). Fans that follow the
+    hottest inlet are controlled without oscillation already, see ``follow_hottest_inlet``.
 
     Args:
         hall: arguments of the hall kernel.

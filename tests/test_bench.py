@@ -43,7 +43,7 @@ def test_all_parts_are_measured_and_speed_is_judged_by_ratios(written: dict[str,
     figures, machine = written["figures"], written["machine"]
     assert machine["cpu"]
     assert len(machine["roof_gb_per_s_and_core"]) == 2
-    parts = "kernel calls environments optima planned scaling start recording"
+    parts = "kernel halls calls environments optima planned scaling start recording"
     assert {f["part"] for f in figures} == set(parts.split())
     assert len({f["name"] for f in figures}) == len(figures)
     for figure in figures:
@@ -53,7 +53,7 @@ def test_all_parts_are_measured_and_speed_is_judged_by_ratios(written: dict[str,
             assert np.isfinite(figure["value"]), figure
     with_target = [f for f in figures if f["target"]]
     assert len(with_target) > 20
-    assert {f["unit"] for f in with_target} <= {"", "relative", "calls", "B/server", "MB"}
+    assert {f["unit"] for f in with_target} <= {"", "relative", "calls", "sweeps", "B/server", "MB"}
     # At tiny size the agreement of the peer is judged alone.
     judged = [f for f in figures if f["met"] is not None]
     assert all(f["unit"] == "relative" and f["met"] for f in judged)

@@ -78,7 +78,10 @@ class DesignPoint:
 
 
 def design_point(
-    config: DataCenterConfig, servers: RackServers | None = None, approach_k: F64 | None = None
+    config: DataCenterConfig,
+    servers: RackServers | None = None,
+    approach_k: F64 | None = None,
+    near: DesignPoint | None = None,
 ) -> DesignPoint:
     """Compute power, airflow and temperatures of every rack at full load and design supply air.
 
@@ -89,6 +92,7 @@ def design_point(
         servers: Servers of the hall, see ``rack_servers``; None computes them.
         approach_k: Inlet minus supply temperature of each rack, K, (R,); None takes the configured
             ones.
+        near: A design point near that of the result, from which the iteration starts.
 
     Raises:
         ConfigError: The approach temperatures leave no positive temperature rise for the servers.
@@ -99,7 +103,8 @@ def design_point(
     group_approach_k = servers.per_group(approach_k)
     height_factor = np.ones(len(servers.count))
     if config.hall.inlet_model == "recirculation":
-        height_factor = _height_factor(config, servers, approach_k)
+        start = height_factor if near is None else near.height_factor
+        height_factor = _height_factor(config, servers, approach_k, start)
     inlet_c = _inlet_c(servers, supply_c, group_approach_k, height_factor)
     return design_point_at(config, servers, inlet_c, height_factor, approach_k=approach_k)
 
@@ -173,14 +178,16 @@ def _at_full_load(config: DataCenterConfig, servers: RackServers, inlet_c: F64) 
     return server_w, curves.moved_ratio(ratio, inlet_c, servers.air.density_ratio)
 
 
-def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F64) -> F64:
+def _height_factor(
+    config: DataCenterConfig, servers: RackServers, approach_k: F64, start: F64
+) -> F64:
     """Return height factors of the groups with an airflow-weighted mean of 1 in each rack, (G,).
 
     Airflow depends on the inlet temperatures, which in turn depend on the height factors. Fixed
     point iteration resolves this dependence.
     """
     supply_c, group_approach_k = config.hall.design_supply_c, servers.per_group(approach_k)
-    factor = np.ones(len(servers.count))
+    factor = start
     within = _EXACT_FACTOR if config.hall.racks <= EXACT_RACKS else _LARGE_FACTOR
     for _ in range(_MOST_HEIGHT_ITERATIONS):
         inlet_c = _inlet_c(servers, supply_c, group_approach_k, factor)

@@ -142,7 +142,9 @@ def _from_layout(
     if config.hall.recirculation.scaled_to == "rack":
         weights = layout_weights(config.hall, design.airflow_m3s)
         return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
-    airflow_m3s = design_point(config, servers, _mean_approach_k(config)).airflow_m3s
+    mean_k, airflow_m3s = _mean_approach_k(config), design.airflow_m3s
+    if np.any(mean_k != config.hall.rack_approach_k()):
+        airflow_m3s = design_point(config, servers, mean_k).airflow_m3s
     weights = layout_weights(config.hall, airflow_m3s)
     return weights, *_shares_by_exposure(
         config, servers, weights, exposure(config.hall, airflow_m3s)
@@ -209,14 +211,17 @@ def _shares_by_exposure(
         ConfigError: The means are too large for the exhaust air, or the iteration fails.
     """
     wanted_k = _mean_approach_k(config)
+    exact, near = config.hall.racks <= EXACT_RACKS, None
 
     def update(approach_k: F64) -> tuple[F64, tuple[F64, DesignPoint]]:
-        design = design_point(config, servers, approach_k)
+        nonlocal near
+        design = design_point(config, servers, approach_k, near)
+        near = None if exact else design
         mix_k = weights.apply(design.outlet_rise_k)
         share = _mean_share(config, mix_k, exposed, wanted_k)
         return share * mix_k, (share, design)
 
-    within_k = _WITHIN_K if config.hall.racks <= EXACT_RACKS else _LARGE_WITHIN_K
+    within_k = _WITHIN_K if exact else _LARGE_WITHIN_K
     return _settled(config, wanted_k, update, within_k)
 
 

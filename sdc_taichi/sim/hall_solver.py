@@ -237,6 +237,8 @@ class Hall:
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
         """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
         self._sparse_dcs = sparse_halls(fleet)
+        self._serial_groups = SERIAL_GROUPS
+        """Problem size up to which kernels run on one thread, see ``SERIAL_GROUPS``."""
         self._sample: Hall | None = None
         """Sampled racks of the data centers ``_sparse_dcs``; None if there are none."""
         if len(self._sparse_dcs):
@@ -566,6 +568,9 @@ class Hall:
         fleet, tables = self._fleet, self._tables
         sample = Hall(sampled_fleet(fleet, self._sparse_dcs, modes), precision)
         sample._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
+        if tables.group_places * LANES > SERIAL_GROUPS:
+            # Where the hall needs threads, its sampled racks use the same compiled kernel.
+            sample._serial_groups = 0
         array, rows = build_steady_states(fleet, self._places, self._dtype, modes)
         dc_ints = tables.rows("dc_ints")
         for name, values in rows.items():
@@ -620,7 +625,7 @@ class Hall:
             self._server_c = vectors(self._dtype, group_places)
         self._step_kernel(
             transient=transient,
-            serial=group_places * LANES * (sweeps if transient else 1) <= SERIAL_GROUPS,
+            serial=group_places * LANES * (sweeps if transient else 1) <= self._serial_groups,
             sweeps=sweeps,
             load_level=self._load_level,
             substep_s=substep_s,

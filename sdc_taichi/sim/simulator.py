@@ -27,7 +27,7 @@ from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.sim.stages import Stages, make_stages
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
-from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult, joined
+from sdc_taichi.types import I32, I64, Actions, ServerLayers, State, StepResult, joined
 
 
 class Simulator:
@@ -194,6 +194,11 @@ class Simulator:
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Return the events that cover step ``step`` of the current run."""
         return self._timeline.active(step)
+
+    @property
+    def sweeps(self) -> I32:
+        """Sweeps, or substeps of transient halls, of each data center in the last step, (B,)."""
+        return self._started().hall.sweeps
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
         """Return inlet, outlet and power of every server in the last step, (S,) each.
