@@ -62,7 +62,9 @@ def sweeps_of_run(preset: str, count: int) -> I32:
     with sdc_taichi.Simulator(configs) as sim:
         sim.reset()
         for step in range(count):
-            cooling = rng.integers(-1, 2, sim.size) * float(step % 8 == 0)
+            cooling = np.zeros(sim.size)
+            if step % 8 == 0:
+                cooling += rng.integers(-1, 2, sim.size)
             sim.step(sdc_taichi.Actions(load=0.0, cooling=cooling, battery=0.0))
             sweeps.append(sim.sweeps)
     return np.array(sweeps, dtype=np.int32)
