@@ -35,7 +35,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/make/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-oldest test-processors test-train bench lint wheel-test dist docs clean
+.PHONY: help demo test test-oldest test-processors test-train fuzz bench lint wheel-test dist docs clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -55,6 +55,9 @@ test-processors: $(READY) ## Run tests of results as on older processors, and wi
 
 test-train: $(READY_TRAIN) ## Install PyTorch, Ray and Minari, and run the tests of training, jobs on Ray and data sets.
 	$(TRAIN)/bin/python -m pytest $(SPREAD) $(TRAINING_TESTS)
+
+fuzz: $(READY) ## Try 3,000 random hostile inputs, in 15 minutes at most; FUZZ holds other options, as --seed 1.
+	$(PY) tests/fuzz.py $(FUZZ)
 
 bench: $(READY) ## Measure every speed target; tables, JSON and plot in runs/bench.
 	$(PY) benchmarks/bench.py
