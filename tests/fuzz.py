@@ -239,7 +239,9 @@ def run_all(
 
 def table(verdicts: dict[Job, Verdict], planned: Sequence[Job]) -> str:
     """Return counts and times of each kind as text."""
-    rows = [("kind", "cases", "ran", "refused", "failed", "mean s", "longest s")]
+    rows: list[tuple[str, ...]] = [
+        ("kind", "cases", "ran", "refused", "failed", "mean s", "longest s")
+    ]
     for kind in [*dict.fromkeys(job.kind for job in planned), None]:
         of_kind = [v for job, v in verdicts.items() if kind in (None, job.kind)]
         counts = [str(sum(v.outcome == x for v in of_kind)) for x in ("ran", "refused", "failed")]

@@ -46,11 +46,13 @@ from sdc_taichi import (
 from sdc_taichi.benchmark.jobs import DoneJob, digest_of, run_job
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.submission import write_submission
+from sdc_taichi.benchmark.sweep import sweep_inputs, sweep_jobs
 from sdc_taichi.cli.app import app
 from sdc_taichi.config import validated
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.exogenous.fetch.download import fetch
 from sdc_taichi.learning.policy import WEIGHTS
+from sdc_taichi.optimum.cache import OptimumCacheWarning
 from sdc_taichi.sim import snapshot
 from test_config import sustaindc_values
 from test_fetch_download import ECHOES, QUICK, SECRET, request_to
@@ -274,8 +276,8 @@ def made_study() -> Path:
 
 @of_worker
 def finished_sweep() -> tuple[Path, list[Any], dict[str, bytes]]:
-    inputs = results.sweep_inputs(results.SWEEP)
-    jobs = list(results.sweep_jobs(results.SWEEP, inputs))
+    inputs = sweep_inputs(results.SWEEP)
+    jobs = list(sweep_jobs(results.SWEEP, inputs))
     for job in jobs:
         ResultStore(worker_folder() / "sweep").keep(run_job(job, inputs))
     return worker_folder() / "sweep", jobs, inputs
@@ -314,7 +316,15 @@ def forged_results(rng: Generator, folder: Path) -> Case:
             ResultStore(target).keep(DoneJob(done.job, rows=rows, metrics=done.metrics))
         else:
             what = forged_record(rng, ResultStore(target).folder_of(record))
-        words = ("benchmark", "report", str(target), "--out", "a.html", "--markdown", "a.md")
+        words: tuple[str, ...] = (
+            "benchmark",
+            "report",
+            str(target),
+            "--out",
+            "a.html",
+            "--markdown",
+            "a.md",
+        )
         return Case(f"{user}: {what}", lambda: command(*words))
     if user == "add":
         shutil.copytree(made_study(), target)
@@ -436,7 +446,7 @@ def forged_optima(rng: Generator, folder: Path) -> Case:
             again = optimum.solved(optimum.config_of("CA"), steps=4, cache=forged.parent)
         check_finite([again.idle, again.achieved])
         if told:
-            assert [each.category for each in told] == [optimum.OptimumCacheWarning], told
+            assert [each.category for each in told] == [OptimumCacheWarning], told
             assert again.achieved.tolist() == first.achieved.tolist()
             assert again.bound.tolist() == first.bound.tolist()
         assert np.all(again.bound <= again.achieved * (1.0 + 1e-6))
@@ -623,7 +633,7 @@ def mutated_state(rng: Generator, state: Any) -> tuple[str, Any]:
         parent[name] = odd_value(rng)
         return f"{place} = {str(parent[name])[:60]!r}", state
     forms: dict[str, Callable[[Any], Any]] = {
-        **{f"{x:g}": lambda a, x=x: np.full(a.shape, x) for x in (np.nan, np.inf, -1e15, 1e6, 0.5)},
+        "one number": lambda a: np.full(a.shape, pick(rng, (np.nan, np.inf, -1e15, 1e6, 0.5))),
         "f16": lambda a: a.astype(np.float16),
         "objects": lambda a: a.astype(object),
         "texts": lambda a: a.astype(str),
