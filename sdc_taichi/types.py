@@ -547,6 +547,9 @@ class StepResult(
     """Index of the step, 0 at reset."""
     step_h: float
     """Length of the step, in h."""
+    within_limits: F64
+    """1 for data centers within the physical limits, (B,). 0 for data centers beyond them, which
+    only simulators with ``limits="flag"`` return: their air is that of an earlier step."""
     unit_flow_m3s: Annotated[F64, Quantity("m3/s", CRAC_UNITS)]
     """Airflow of each CRAC unit."""
 

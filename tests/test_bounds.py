@@ -6,6 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
 from sdc_taichi.sim.fleet import build_fleet
+from sdc_taichi.sim.hall_solver import Conditions
 from sdc_taichi.sim.physical_limits import LIMITS
+from simulated import assert_same, part_of
 
 BOUNDS = (("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum"))
 
@@ -228,8 +231,82 @@ def test_air_that_finds_no_steady_state_ends_the_run_in_a_step_that_is_named() -
     with Simulator(load_config("corrected", changes)) as sim:
         sim.reset()
         sim.step()
-        with pytest.raises(PhysicalLimitError, match=r"^corrected: no steady .* \(step 1\)$"):
+        cause = r"CRAC units move 0\.\d+ m3/s, the most in this step, and the racks draw 2\d\.\d"
+        message = rf"^corrected: no steady .*{cause}.* \(step 1\)$"
+        with pytest.raises(PhysicalLimitError, match=message):
             sim.step()
+
+
+UNIT_DOWN = ["hvac.crac.coasting_flow_ratio=0.01", "servers.curve_limit_c=null",
+             "events.scheduled=[{kind: crac_down, start_h: 0.5, duration_h: 1}]"]  # fmt: skip
+RACK_3 = "{kind: rack_fan_failure, rack: 3, start_h: %g, duration_h: 0.5, share: 0.01}"
+
+
+@pytest.mark.parametrize(
+    ("common", "impossible", "limit_c", "flagged"),
+    [
+        ([], UNIT_DOWN, 400.0, [2, 3, 4, 5]),
+        ([], [f"events.scheduled=[{RACK_3 % 0.5}]"], 400.0, [2, 3]),
+        ([], [f"events.scheduled=[{RACK_3 % 0.0}]"], 400.0, [0, 1]),
+        (["simulation.thermal=transient"], [f"events.scheduled=[{RACK_3 % 0.5}]"], 40.0, [2, 3]),
+    ],
+)
+def test_one_hall_beyond_its_limits_keeps_its_last_air_and_stops_no_other(
+    common: list[str],
+    impossible: list[str],
+    limit_c: float,
+    flagged: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sdc_taichi.sim.simulator.AIR_LIMITS_C", (-100.0, limit_c))
+    a, c = (load_config("corrected", [f"name={name}", *common]) for name in "ac")
+    b = load_config("corrected", ["name=b", *common, *impossible])
+    without = b.model_copy(update={"events": a.events})
+    configs, others = [a, b, c], [a, without, c]
+    with Simulator(configs, limits="flag") as sim, Simulator(others) as twin:
+        sim.reset(seed=0)
+        twin.reset(seed=0)
+        results = [sim.step() for _ in range(8)]
+        expected = [twin.step() for _ in range(8)]
+        layers = sim.servers()
+    for index in (0, 2):
+        assert_same(
+            [part_of(result, configs, index) for result in results],
+            [part_of(result, others, index) for result in expected],
+        )
+    within = np.array([result.within_limits for result in results])
+    assert np.flatnonzero(within[:, 1] == 0.0).tolist() == flagged
+    assert np.all(within[:, [0, 2]] == 1.0)
+    for result in results:
+        assert all(np.all(np.isfinite(getattr(result, f.name))) for f in fields(result))
+    assert np.all(np.isfinite([layers.inlet_c, layers.outlet_c, layers.power_w]))
+    before = results[flagged[0] - 1] if flagged[0] else None
+    for step in flagged:
+        held = part_of(results[step], configs, 1)
+        if before is None:
+            assert np.all(held.rack_outlet_c == held.supply_c)
+            assert held.it_w == 0.0
+        else:
+            last = part_of(before, configs, 1)
+            np.testing.assert_array_equal(held.rack_outlet_c, last.rack_outlet_c)
+            np.testing.assert_array_equal(held.it_w, last.it_w)
+
+
+def test_transient_halls_without_a_steady_state_can_be_reset() -> None:
+    changes = ["simulation.thermal=transient", "servers.curve_limit_c=null"]
+    with Simulator(load_config("corrected", changes), limits="flag") as sim:
+        sim.reset()
+        hall = sim._started().hall
+        still = np.full(sim.fleet.units, 1e-3)
+        state = hall.steady_state(
+            Conditions(np.full(sim.fleet.units, 20.0), np.ones(1), unit_low=still, unit_high=still)
+        )
+    np.testing.assert_array_equal(state.server_c, np.float32(20.0))
+
+
+def test_unknown_treatment_of_limits_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"^limits 'ignore': valid are raise and flag$"):
+        Simulator(load_config("tiny"), limits="ignore")  # type: ignore[arg-type]
 
 
 def test_an_event_starts_before_the_end_of_the_run() -> None:

@@ -6,11 +6,12 @@ memory between steps is a part of ``State``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import Fleet
@@ -21,6 +22,14 @@ from sdc_taichi.sim.work_allocation import Placement
 from sdc_taichi.types import F64, State, fields_of
 
 J_PER_KWH = 3.6e6
+_AXES = {"unit": "U", "rack": "R"}
+"""Axes of the fields of ``HallSums`` by the first part of their names; those of others are B."""
+_STATE_AXES = {
+    **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
+    **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
+    **dict.fromkeys(("need_m3s", "following", "supply_excess_k"), "U"),
+}
+"""Axes of the temperatures in ``State``."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))
 _EMPTY = np.zeros(0)
 
@@ -160,6 +169,74 @@ class _GroupInlets:
     def last(self) -> F64:
         """Return the inlet temperatures of the last step, in C, (G,); empty if unused."""
         return self._hall.group_inlets() if self._keep else _EMPTY
+
+
+def plain_supply_air(like: HallSums, supply: Supply, fleet: Fleet) -> HallSums:
+    """Return the air of halls without heat: all air is supply air, and servers draw no power.
+
+    Args:
+        like: Results of a step, for the types of their arrays.
+        supply: Operation of the CRAC units.
+        fleet: The data centers.
+    """
+    coldest_c = supply.coldest_supply_c
+    mean_c = fleet.unit_sums(coldest_c) / np.diff(fleet.unit_offsets)
+    supply_c = {"U": coldest_c, "B": mean_c, "R": mean_c[fleet.rack_dc]}
+    values = {name: np.zeros_like(value) for name, value in fields_of(like).items()}
+    for name, value in values.items():
+        if name.endswith("_c"):
+            value[:] = supply_c[_axis(name)]
+    values["units_flow_m3s"][:] = fleet.design_flow_m3s
+    values["unit_airflow_m3s"][:] = fleet.unit_design_m3s
+    return HallSums(**values)
+
+
+def held_air(
+    air: HallSums,
+    thermal: Mapping[str, Any],
+    beyond: npt.NDArray[np.bool_],
+    *,
+    last: HallSums,
+    state: State,
+    fleet: Fleet,
+) -> tuple[HallSums, dict[str, Any]]:
+    """Replace the air of data centers beyond their limits by air of an earlier step.
+
+    Args:
+        air: Results of the step.
+        thermal: Temperatures at the end of the step by their field names in ``State``.
+        beyond: True for data centers beyond their limits, (B,).
+        last: Results of the earlier step.
+        state: State at the start of the step, whose temperatures these data centers keep.
+        fleet: The data centers.
+
+    Returns:
+        Results and temperatures; those of the other data centers are unchanged.
+    """
+    racks = beyond[fleet.rack_dc]
+    of_axis = {
+        "B": beyond,
+        "U": beyond[fleet.unit_dc],
+        "R": racks,
+        "G": np.repeat(racks, np.diff(fleet.group_offsets)),
+    }
+    values = {
+        name: np.where(of_axis[_axis(name)], getattr(last, name), value)
+        for name, value in fields_of(air).items()
+    }
+    values["room_j"] = np.where(beyond, state.room_heat_kwh * J_PER_KWH, values["room_j"])
+    after = {
+        name: np.where(of_axis[_STATE_AXES[name]], getattr(state, name), value)
+        if len(value)
+        else value
+        for name, value in thermal.items()
+    }
+    return HallSums(**values), after
+
+
+def _axis(name: str) -> str:
+    """Return the axis of a field of ``HallSums``."""
+    return _AXES.get(name.split("_")[0], "B")
 
 
 def _conditions(

@@ -8,8 +8,9 @@ from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from sdc_taichi.errors import RuntimeStateError, SdcError
+from sdc_taichi.errors import PhysicalLimitError, RuntimeStateError, SdcError
 from sdc_taichi.hall.initial_guess import TABLE_LOADS, USUAL_GAIN
 from sdc_taichi.hall.steady_modes import SteadyModes, extended_modes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
@@ -31,7 +32,7 @@ from sdc_taichi.kernels.hall_arguments import (
     RUNNING,
     STEP_ARGUMENTS,
 )
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.hall_tables import (
     build_hall_tables,
     build_rows_along_racks,
@@ -232,6 +233,12 @@ class Hall:
         self._has_rows_along_racks = False
         self.hottest_outlet_c = 0.0
         """Highest server outlet temperature of all halls in the last step, in C."""
+        self.flags_limits = False
+        """True if halls without steady air, or with infinite temperatures, are entered into
+        ``beyond_limits`` instead of raising an error."""
+        self.beyond_limits: npt.NDArray[np.bool_] | None = None
+        """True for data centers without steady air or with infinite temperatures in the last step,
+        (B,); None if there are none."""
         self._was_transient: bool | None = None
         """True if the last step was transient; None if there is no last step."""
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
@@ -256,7 +263,8 @@ class Hall:
             conditions: Supply air, load and failures.
 
         Raises:
-            PhysicalLimitError: There is no steady state, for example because no unit moves air.
+            PhysicalLimitError: There is no steady state, for example because no unit moves air, and
+                ``flags_limits`` is False.
             SdcError: A condition is not finite or has the wrong shape.
         """
         self._set_conditions(conditions)
@@ -264,6 +272,7 @@ class Hall:
         self._dc["fan_speed"][:] = 1.0
         self._begin_step(exchanges_before=0)
         dc_out = self._new_results()
+        self.beyond_limits = None
         if not self._recirculates:
             self._call_step_kernel(dc_out)
         else:
@@ -272,7 +281,9 @@ class Hall:
             self._run_sweeps(dc_out, MOST_SWEEPS)
             status = self._control["status"]
             if np.minimum.reduce(status) == NOT_CONVERGED:
-                raise no_steady_air_error(self._fleet.names[int(np.argmin(status))], MOST_SWEEPS)
+                if not self.flags_limits:
+                    raise self._no_steady_air_error(int(np.argmin(status)))
+                self.beyond_limits = status == NOT_CONVERGED
         return self._results(dc_out, transient=False)
 
     def advance(
@@ -295,6 +306,7 @@ class Hall:
         self._set_coil(coil, state.supply_excess_k)
         substeps = int(np.ceil(step_s / substep_s - 1e-9))
         dc_out = self._new_results()
+        self.beyond_limits = None
         self._begin_step(exchanges_before=1)
         before = np.ascontiguousarray(state.server_c, self._dtype)
         after = np.empty(self._fleet.groups, self._dtype)
@@ -333,7 +345,35 @@ class Hall:
         for row, values in zip(air, steady, strict=True):
             row[:] = values
         self.discard_last_step()
-        return self._hall_state(server_c)
+        state = self._hall_state(server_c)
+        return state if self.beyond_limits is None else self._at_supply(state, conditions)
+
+    def _at_supply(self, state: HallState, conditions: Conditions) -> HallState:
+        """Set all temperatures of data centers beyond their limits to that of their supply air."""
+        fleet = self._fleet
+        mean_c = fleet.unit_sums(conditions.unit_supply_c) / np.diff(fleet.unit_offsets)
+        rack_c = mean_c[fleet.rack_dc]
+        assert self.beyond_limits is not None
+        racks, units = self.beyond_limits[fleet.rack_dc], self.beyond_limits[fleet.unit_dc]
+        groups = np.diff(fleet.group_offsets)
+        per_strength = self._places.values_of_racks(self._rack["per_strength"][None])[0]
+        strength = np.divide(1.0, per_strength, out=np.zeros(fleet.racks), where=per_strength > 0)
+        new = {
+            "server_c": (np.repeat(racks, groups), np.repeat(rack_c, groups)),
+            "mixed_c": (racks, rack_c),
+            "exhaust_c": (racks, rack_c * strength),
+            "captured_m3s": (racks, 0.0),
+            "need_m3s": (units, fleet.unit_design_m3s),
+            "following": (units, 1.0),
+            "supply_excess_k": (units, 0.0),
+        }
+        return HallState(
+            **{
+                name: np.where(rows, values, before).astype(before.dtype)
+                for name, (rows, values) in new.items()
+                for before in [getattr(state, name)]
+            }
+        )
 
     def discard_last_step(self) -> None:
         """Forget the last step, so that ``servers`` cannot return layers of an outdated state."""
@@ -718,6 +758,19 @@ class Hall:
             self._rack_out = self._aligned(self._rack_out.shape)
         return np.empty((len(DC_OUT), self._fleet.size))
 
+    def _no_steady_air_error(self, dc: int) -> PhysicalLimitError:
+        """Return the error for a data center whose sweeps have not converged."""
+        units = slice(*self._fleet.unit_offsets[dc : dc + 2])
+        most_m3s = self._unit["high"][units] * self._fleet.unit_design_m3s[units]
+        return no_steady_air_error(
+            self._fleet.names[dc],
+            MOST_SWEEPS,
+            flow_m3s=float(self._unit_state["flow_m3s"][units].sum()),
+            most_m3s=float(most_m3s.sum()),
+            need_m3s=float(self._unit_state["need_m3s"][units].sum()),
+            limits_coils=bool(np.any(self._fleet.unit_capacity_w[units] < NO_LIMIT_W)),
+        )
+
     def _results(self, dc_out: F64, *, transient: bool) -> HallSums:
         """Collect and check the results of a finished step, after which layers are available."""
         racks = self._rack_out.reshape(len(self._rack_out), -1)
@@ -727,7 +780,11 @@ class Hall:
         self.hottest_outlet_c = float(np.maximum.reduce(outlets_c))
         # A NaN anywhere in a hall propagates to its outlets, so checking the outlets is enough.
         if not self.hottest_outlet_c < BEYOND_NUMBERS_C:
-            raise no_number_error(outlets_c, self._fleet)
+            if not self.flags_limits:
+                raise no_number_error(outlets_c, self._fleet)
+            infinite = self._fleet.rack_sums(~(outlets_c < BEYOND_NUMBERS_C)) > 0
+            before = self.beyond_limits
+            self.beyond_limits = infinite if before is None else infinite | before
         self._was_transient = transient
         results = dict(zip(RESULT_NAMES, (*dc_out, *racks), strict=True))
         unit = self._unit_state

@@ -6,25 +6,28 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from operator import itemgetter
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
+from sdc_taichi.sim.air import held_air, plain_supply_air
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.sim.stages import Stages, make_stages
+from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import I32, I64, Actions, ServerLayers, State, StepResult, joined
@@ -37,6 +40,12 @@ class Simulator:
         fleet: A fleet, one config or several.
         drivers: Exogenous inputs; None reads the inputs that the configs name.
         precision: Precision of the server kernels; sums and all other stages use f64.
+        limits: Outcome of a step in which a hall has no steady air, or in which a result is beyond
+            its physical limits. With ``raise`` the step raises an error. With ``flag``, only
+            ``within_limits`` of this data center becomes 0. Its air in this step is that of its
+            last step within limits, or supply air without heat before any such step, and the
+            temperatures in its state stay. It has air of its own again as soon as that is
+            physical. The other data centers do not change.
 
     Raises:
         SdcError: A config or input is not valid.
@@ -48,9 +57,17 @@ class Simulator:
         *,
         drivers: Drivers | None = None,
         precision: Precision = "f32",
+        limits: Literal["raise", "flag"] = "raise",
     ) -> None:
         if precision not in ("f32", "f64"):
             raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
+        if limits not in ("raise", "flag"):
+            raise ConfigError(f"limits {limits!r}: valid are raise and flag")
+        self._flags_limits = limits == "flag"
+        # Air of the last step within limits; None before a step, and with limits="raise".
+        self._last_air: HallSums | None = None
+        # True for data centers beyond their limits in the last step, (B,); None without any.
+        self._beyond: npt.NDArray[np.bool_] | None = None
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
         inputs = load_drivers(self.fleet.configs) if drivers is None else drivers
         # The inputs are None after ``close``.
@@ -159,7 +176,8 @@ class Simulator:
             actions: Commands; None means neutral load, held or scheduled setpoint, idle battery.
 
         Raises:
-            PhysicalLimitError: A result is physically impossible; the state does not change.
+            PhysicalLimitError: A result is physically impossible, and ``limits`` is ``raise``; the
+                state does not change.
             RuntimeStateError: The simulator is not reset or is closed, or runs in a forked process.
             SdcError: A command is not finite, out of range or of the wrong shape.
         """
@@ -181,15 +199,62 @@ class Simulator:
         except PhysicalLimitError as error:
             raise PhysicalLimitError(f"{error} (step {state.step})") from None
         plant = stages.facility.step(state, commands, surroundings, supply, air)
+        self._beyond = None
+        inside, hall = plant["within_limits"], stages.hall
+        is_hot = hall.hottest_outlet_c > AIR_LIMITS_C[1]
+        if is_hot or np.minimum.reduce(inside) < 1.0 or hall.beyond_limits is not None:
+            if not self._flags_limits:
+                quantities = {**vars(surroundings), **vars(air), **plant}
+                raise limit_error(inside, quantities, state.step, self.fleet)
+            air, thermal, plant = self._hold_air(
+                state, commands, surroundings, supply, air, thermal, plant
+            )
+        if self._flags_limits:
+            self._last_air = air
         racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
         stage_results = map(vars, (commands, surroundings, work, supply, air, racks))
         step = {"step": state.step, "step_h": self.step_h}
         result = StepResult(*_values_of_result(joined(step, *stage_results, plant)))
-        inside, hottest_c = plant["within_limits"], stages.hall.hottest_outlet_c
-        if np.minimum.reduce(inside) < 1.0 or hottest_c > AIR_LIMITS_C[1]:
-            raise limit_error(inside, result, self.fleet)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
         return result
+
+    def _hold_air(
+        self,
+        state: State,
+        commands: Commands,
+        surroundings: Surroundings,
+        supply: Supply,
+        air: HallSums,
+        thermal: dict[str, Any],
+        plant: dict[str, Any],
+    ) -> tuple[HallSums, dict[str, Any], dict[str, Any]]:
+        """Continue with air of an earlier step where a data center is beyond its limits.
+
+        Args:
+            state: State at the start of the step.
+            commands: Commands of the step.
+            surroundings: Surroundings of the step.
+            supply: Operation of the CRAC units.
+            air: Results of the halls.
+            thermal: Temperatures at the end of the step.
+            plant: Results of the facility.
+
+        Returns:
+            The last three arguments with the values of these data centers replaced.
+        """
+        fleet, stages = self.fleet, self._started()
+        hottest_c = np.maximum.reduceat(air.rack_outlet_max_c, fleet.rack_offsets[:-1])
+        beyond = ~((plant["within_limits"] > 0.0) & (hottest_c <= AIR_LIMITS_C[1]))
+        if stages.hall.beyond_limits is not None:
+            beyond |= stages.hall.beyond_limits
+        last = self._last_air
+        if last is None:
+            last = plain_supply_air(air, supply, fleet)
+        air, thermal = held_air(air, thermal, beyond, last=last, state=state, fleet=fleet)
+        plant = stages.facility.step(state, commands, surroundings, supply, air)
+        plant["within_limits"] = np.where(beyond, 0.0, plant["within_limits"])
+        self._beyond = beyond
+        return air, thermal, plant
 
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Return the events that cover step ``step`` of the current run."""
@@ -210,7 +275,8 @@ class Simulator:
             RuntimeStateError: No step has been done.
             SdcError: ``into`` has a wrong shape, type or memory order, or is read-only.
         """
-        return self._started().hall.servers(into)
+        hall = self._started().hall
+        return self._with_held(hall.servers(into), self.fleet.per_rack_servers())
 
     def server_groups(self) -> ServerLayers:
         """Return inlet, outlet and power of one server of each group in the last step, (G,) each.
@@ -220,7 +286,28 @@ class Simulator:
         Raises:
             RuntimeStateError: No step has been done.
         """
-        return self._started().hall.groups()
+        groups = self._started().hall.groups()
+        return self._with_held(groups, np.diff(self.fleet.group_offsets))
+
+    def _with_held(self, layers: ServerLayers, per_rack: npt.NDArray[Any]) -> ServerLayers:
+        """Overwrite layers of data centers beyond their limits with means of their racks.
+
+        Args:
+            layers: Layers of the last step, with ``per_rack`` entries of each rack.
+            per_rack: Number of entries of each rack, (R,).
+        """
+        if self._beyond is None or self._last_air is None:
+            return layers
+        counts, air = per_rack.astype(np.int64), self._last_air
+        rows = np.repeat(self._beyond[self.fleet.rack_dc], counts)
+        server_w = (air.rack_cpu_w + air.rack_fan_w) / self.fleet.per_rack_servers()
+        for layer, of_rack in (
+            (layers.inlet_c, air.rack_inlet_c),
+            (layers.outlet_c, air.rack_outlet_c),
+            (layers.power_w, server_w),
+        ):
+            layer[rows] = np.repeat(of_rack, counts)[rows]
+        return layers
 
     def intake_air(self) -> IntakeAir:
         """Return the air before the racks in the last step, the input of ``Inlets``.
@@ -278,6 +365,7 @@ class Simulator:
         """
         inputs = self.drivers if drivers is None else self._checked_drivers(drivers)
         self._started().hall.discard_last_step()
+        self._last_air = self._beyond = None
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
         self._drivers = replace(inputs, start=state.start)
@@ -314,7 +402,7 @@ class Simulator:
         """Release state, inputs and kernel arrays; a closed simulator keeps only its ``fleet``."""
         if self._stages is not None:
             self._stages.workload.close()
-        self._stages = self._state = self._drivers = None
+        self._stages = self._state = self._drivers = self._last_air = None
 
     def __enter__(self) -> Self:
         return self
@@ -329,6 +417,7 @@ class Simulator:
             self._stages = make_stages(
                 self.fleet, self.drivers, self.precision, event_free=self._timeline.event_free
             )
+            self._stages.hall.flags_limits = self._flags_limits
         return self._stages
 
     def _check_open(self) -> None:
