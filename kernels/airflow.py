@@ -73,7 +73,7 @@ _FALL = 0.5
 
 SYSTEM_ARGUMENTS = {
     "serial": Argument("template"),  # True: run on the calling thread alone
-    "through_racks": Argument("template"),  # True if air passes through the racks
+    "through_racks": Argument("i32"),  # 1 if air passes through the racks, otherwise 0
     "slices": Argument("i32"),  # number of parts of the right sides, one thread each
     "most_iterations": Argument("i32"),  # maximum number of iterations for one right side
     "tolerance": Argument("f64"),  # |r| / |b| at which a system counts as solved
@@ -98,12 +98,14 @@ SYSTEM_ARGUMENTS = {
     "return_cell": Argument("i32", 1),  # cell before each return face
     "return_m3s": Argument("f64", 1),  # flow out of each return face, m3/s
     "first_solution": Argument("f64", 1),  # solution of the first right side, (N + 1,)
-    "intake": Argument("f64", 2),  # mean solution over the front of each rack, (R, T)
-    "returned": Argument("f64", 1),  # flow times solution, summed over the returns, (T,)
-    "relative_residual": Argument("f64", 1),  # |r| / |b|, 0 where b is 0, (T,)
-    "iterations": Argument("i32", 1),  # number of iterations, (T,)
+    # Vectors of lanes, for each of G groups of right sides.
+    "intake": Argument("f64", 2),  # mean solution over the front of each rack, (R, G)
+    "returned": Argument("f64", 1),  # flow times solution, summed over the returns, (G,)
+    "relative_residual": Argument("f64", 1),  # |r| / |b|, 0 where b is 0, (G,)
+    "iterations": Argument("f64", 1),  # number of iterations, (G,)
 }
 """Arguments of the kernels of ``bicgstab_kernel`` by name, template arguments first."""
+_OF_LANES = {"work", "intake", "returned", "relative_residual", "iterations"}
 
 
 @cache
@@ -188,7 +190,10 @@ def bicgstab_kernel(lanes: int) -> Any:
     Args:
         lanes: number of right sides that are solved side by side, at least 2.
     """
-    arguments = {**SYSTEM_ARGUMENTS, "work": replace(SYSTEM_ARGUMENTS["work"], lanes=lanes)}
+    arguments = {
+        name: replace(argument, lanes=lanes) if name in _OF_LANES else argument
+        for name, argument in SYSTEM_ARGUMENTS.items()
+    }
     name, constants = f"solve_{lanes}_systems", {"lanes": lanes}
     return define_kernel(
         name, arguments, run_slice, precision="f64", lanes=lanes, constants=constants
@@ -202,15 +207,14 @@ def run_slice(system: ti.template(), s):
     no_cell = system.diagonal.shape[0]
     for vector in range(WORK_VECTORS):
         system.work[s, vector, no_cell] = system.zeros
-    if ti.static(system.through_racks):
+    if system.through_racks == 1:
         for c in range(no_cell):
             system.work[s, _CARRIED, c] = system.zeros
     factorise(system, s)
-    right_sides = system.relative_residual.shape[0]
-    first, end = part_of(s, system.slices, (right_sides + system.lanes - 1) // system.lanes)
+    first, end = part_of(s, system.slices, system.relative_residual.shape[0])
     for group in range(first, end):
-        solve_right_sides(system, s, group * system.lanes)
-        store_results(system, s, group * system.lanes)
+        solve_right_sides(system, s, group)
+        store_results(system, s, group)
 
 
 @ti.func
@@ -274,7 +278,7 @@ def multiplied(system: ti.template(), s, vector, out, c):
         total = total + system.off_diagonal[c, face] * (
             system.work[s, out, b] - system.work[s, _UNSCALED, b]
         )
-    if ti.static(system.through_racks):
+    if system.through_racks == 1:
         total = total - system.work[s, _CARRIED, c]
     product = z + system.work[s, vector, c] + inverse_pivot * total
     system.work[s, out, c] = product
@@ -295,7 +299,7 @@ def front_mean(system: ti.template(), s, vector, rack):
 @no_type_check
 def carry_through_racks(system: ti.template(), s):
     """Set the last work vector to what air carries from the fronts of racks to their backs."""
-    if ti.static(system.through_racks):
+    if system.through_racks == 1:
         for i in range(system.back_cell.shape[0]):
             system.work[s, _CARRIED, system.back_cell[i]] = system.zeros
         for rack in range(system.front_offsets.shape[0] - 1):
@@ -308,28 +312,25 @@ def carry_through_racks(system: ti.template(), s):
 
 @ti.func
 @no_type_check
-def load_right_sides(system: ti.template(), s, first, out):
-    """Set the lanes of ``out`` to the right sides from ``first`` on, and further lanes to 0."""
+def load_right_sides(system: ti.template(), s, group, out):
+    """Set the lanes of ``out`` to the right sides of a group, and lanes beyond the last to 0."""
     for c in range(system.diagonal.shape[0]):
         system.work[s, out, c] = system.zeros
-    for lane in ti.static(range(system.lanes)):
-        unit = ti.Vector([ti.cast(k == lane, ti.f64) for k in ti.static(range(system.lanes))])
-        if first + lane < system.relative_residual.shape[0]:
-            begin, end = (
-                system.source_offsets[first + lane],
-                system.source_offsets[first + lane + 1],
-            )
-            for i in range(begin, end):
+    for lane in range(system.lanes):
+        rhs = group * system.lanes + lane
+        if rhs < system.source_offsets.shape[0] - 1:
+            unit = ti.Vector([ti.cast(k == lane, ti.f64) for k in ti.static(range(system.lanes))])
+            for i in range(system.source_offsets[rhs], system.source_offsets[rhs + 1]):
                 c = system.source_cell[i]
                 system.work[s, out, c] = system.work[s, out, c] + system.source[i] * unit
 
 
 @ti.func
 @no_type_check
-def solve_right_sides(system: ti.template(), s, first):
-    """Solve for the right sides from ``first`` on; store iterations and relative residuals."""
+def solve_right_sides(system: ti.template(), s, group):
+    """Solve for the right sides of a group; store iterations and relative residuals."""
     cells = system.diagonal.shape[0]
-    load_right_sides(system, s, first, _RESIDUAL)
+    load_right_sides(system, s, group, _RESIDUAL)
     square = system.zeros
     for c in range(cells):
         square = square + system.work[s, _RESIDUAL, c] * system.work[s, _RESIDUAL, c]
@@ -341,7 +342,7 @@ def solve_right_sides(system: ti.template(), s, first):
     starts, ends = 0, False
     while starts < MOST_STARTS and not ends:
         starts += 1
-        rho, residual_norm = start_iterations(system, s, first)
+        rho, residual_norm = start_iterations(system, s, group)
         zeros, ones = system.zeros, system.zeros + 1.0
         unsolved = ti.select(residual_norm > goal, ones, zeros)
         unsolved = ti.select(iterations < most_iterations, unsolved, zeros)
@@ -349,20 +350,15 @@ def solve_right_sides(system: ti.template(), s, first):
         if not ends:
             fall = _FALL * quotient(goal, residual_norm)
             iterations = iterate(system, s, rho, fall * ti.sqrt(rho), unsolved, iterations)
-    for lane in ti.static(range(system.lanes)):
-        if first + lane < system.relative_residual.shape[0]:
-            residual = ti.cast(0.0, ti.f64)
-            if goal[lane] > 0.0:
-                residual = system.tolerance * residual_norm[lane] / goal[lane]
-            system.relative_residual[first + lane] = residual
-            system.iterations[first + lane] = ti.cast(iterations[lane], ti.i32)
+    system.relative_residual[group] = system.tolerance * quotient(residual_norm, goal)
+    system.iterations[group] = iterations
 
 
 @ti.func
 @no_type_check
-def start_iterations(system: ti.template(), s, first):
+def start_iterations(system: ti.template(), s, group):
     """Set r and r^ to (D + L)^-1 (b - A x), and p and v to 0; return rho and |b - A x|."""
-    load_right_sides(system, s, first, _RESIDUAL)
+    load_right_sides(system, s, group, _RESIDUAL)
     unscale(system, s, _SOLUTION)
     carry_through_racks(system, s)
     square, rho = system.zeros, system.zeros
@@ -372,7 +368,7 @@ def start_iterations(system: ti.template(), s, first):
             - system.diagonal[c] * system.work[s, _UNSCALED, c]
             + above(system, s, _UNSCALED, c)
         )
-        if ti.static(system.through_racks):
+        if system.through_racks == 1:
             residual = residual + system.work[s, _CARRIED, c]
         for face in ti.static(range(3)):
             residual = (
@@ -471,21 +467,15 @@ def iterate(system: ti.template(), s, rho_at_start, goal, unsolved, iterations_b
 
 @ti.func
 @no_type_check
-def store_results(system: ti.template(), s, first):
-    """Store rack intakes, returned flow, and the first solution, for right sides from ``first``."""
+def store_results(system: ti.template(), s, group):
+    """Store rack intakes, returned flow, and the first solution, for the right sides of a group."""
     unscale(system, s, _SOLUTION)
-    right_sides = system.relative_residual.shape[0]
     for rack in range(system.front_offsets.shape[0] - 1):
-        mean = front_mean(system, s, _UNSCALED, rack)
-        for lane in ti.static(range(system.lanes)):
-            if first + lane < right_sides:
-                system.intake[rack, first + lane] = mean[lane]
+        system.intake[rack, group] = front_mean(system, s, _UNSCALED, rack)
     total = system.zeros
     for i in range(system.return_cell.shape[0]):
         total = total + system.return_m3s[i] * system.work[s, _UNSCALED, system.return_cell[i]]
-    for lane in ti.static(range(system.lanes)):
-        if first + lane < right_sides:
-            system.returned[first + lane] = total[lane]
-    if first == 0:
+    system.returned[group] = total
+    if group == 0:
         for c in range(system.diagonal.shape[0] + 1):
             system.first_solution[c] = system.work[s, _UNSCALED, c][0]

@@ -345,11 +345,14 @@ class _GridAir:
         # One vector of right-hand sides for each thread at a time, to show the progress.
         for first in range(0, right_sides, slices * lanes):
             part = slice(first, min(first + slices * lanes, right_sides))
-            intake = np.empty((self._racks, part.stop - first))
+            count = part.stop - first
+            groups = -(-count // lanes)
+            intake = aligned((self._racks, groups, lanes), np.float64)
+            returned, residual, iterations = aligned((3, groups, lanes), np.float64)
             self._run(
                 kernels.bicgstab_kernel(lanes),
                 serial=False,
-                through_racks=through_racks,
+                through_racks=int(through_racks),
                 slices=slices,
                 most_iterations=_MOST_ITERATIONS,
                 tolerance=_TOLERANCE,
@@ -371,11 +374,14 @@ class _GridAir:
                 return_m3s=grid.return_m3s,
                 first_solution=solution.first_solution,
                 intake=intake,
-                returned=solution.returned[part],
-                relative_residual=solution.relative_residual[part],
-                iterations=solution.iterations[part],
+                returned=returned,
+                relative_residual=residual,
+                iterations=iterations,
             )
-            solution.intake[:, part] = intake
+            solution.intake[:, part] = intake.reshape(self._racks, -1)[:, :count]
+            solution.returned[part] = returned.reshape(-1)[:count]
+            solution.relative_residual[part] = residual.reshape(-1)[:count]
+            solution.iterations[part] = iterations.reshape(-1)[:count]
             if right_sides > 1:
                 self._tell(part.stop)
         residual, iterations = solution.relative_residual, solution.iterations
