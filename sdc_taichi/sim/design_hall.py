@@ -92,7 +92,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     """
     fleet = build_fleet(config)
     supply_c = config.hall.design_supply_c
-    hall = Hall(fleet, "f64")
+    hall = Hall(fleet, "f64", samples=False)
     unit_supply_c = np.full(fleet.units, supply_c)
     speed = np.repeat(fleet.design_speed, fleet.units)
     sums = hall.solve(Conditions(unit_supply_c, np.ones(1), unit_low=speed, unit_high=speed))

@@ -182,9 +182,11 @@ class Hall:
     Args:
         fleet: The data centers.
         precision: Precision of the temperatures and powers of servers and racks.
+        samples: True if large halls start from sampled racks. False saves the preparation if few
+            steps are solved.
     """
 
-    def __init__(self, fleet: Fleet, precision: Precision) -> None:
+    def __init__(self, fleet: Fleet, precision: Precision, *, samples: bool = True) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import hall, layers
         from sdc_taichi.kernels.compiler.named_kernel import NamedKernel
@@ -243,12 +245,13 @@ class Hall:
         """True if the last step was transient; None if there is no last step."""
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
         """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
+        self._dc["feedback_gain"][:] = USUAL_GAIN
         self._sparse_dcs = sparse_halls(fleet)
         self._serial_groups = SERIAL_GROUPS
         """Problem size up to which kernels run on one thread, see ``SERIAL_GROUPS``."""
         self._sample: Hall | None = None
         """Sampled racks of the data centers ``_sparse_dcs``; None if there are none."""
-        if len(self._sparse_dcs):
+        if samples and len(self._sparse_dcs):
             self._add_sampled_racks(precision)
 
     @property
@@ -557,7 +560,6 @@ class Hall:
         for row in controls:
             row[:] = 0.0
         self._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
-        self._dc["feedback_gain"][:] = USUAL_GAIN
         for loads in LEVELS:
             states_of_dc = self._steady_states([*dcs.values()], loads)
             states = {entry: states_of_dc[dc] for entry, dc in dcs.items()}
@@ -604,8 +606,17 @@ class Hall:
         }
 
     def _set_modes(self, modes: dict[int, SteadyModes], precision: Precision) -> None:
-        """Let the sweeps of sparse halls start from their modes and sampled racks."""
+        """Let the sweeps of sparse halls start from their modes and sampled racks.
+
+        A hall without steady air in any of the computed states has no modes.
+        """
         fleet, tables = self._fleet, self._tables
+        assert fleet.air is not None
+        modes = {entry: of_hall for entry, of_hall in modes.items() if len(of_hall.racks)}
+        entries = fleet.air.steady_state_of_dc[self._sparse_dcs]
+        self._sparse_dcs = self._sparse_dcs[np.isin(entries, [*modes])]
+        if not modes:
+            return
         sample = Hall(sampled_fleet(fleet, self._sparse_dcs, modes), precision)
         sample._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
         if tables.group_places * LANES > SERIAL_GROUPS:
