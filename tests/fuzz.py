@@ -223,6 +223,8 @@ def run_all(
             verdicts[worker.job] = verdict
             if verdict.outcome == "failed":
                 print(f"\nFAILED {worker.job.command()}\n{verdict.text}", flush=True)
+            if len(verdicts) % 300 == 0:
+                print(f"{len(verdicts)} of {len(jobs)} cases", flush=True)
             alive = worker.process.is_alive() and not worker.process.exitcode
             if waiting and time.monotonic() < end:
                 job = waiting.popleft()
