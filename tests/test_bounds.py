@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from pydantic import BaseModel
@@ -20,9 +22,11 @@ from sdc_taichi import (
     ConfigError,
     DataCenterConfig,
     DataError,
+    EndedBy,
     EnvOptions,
     SdcError,
     Simulator,
+    aec_env,
     drivers_from_arrays,
     load_config,
     make_configs,
@@ -33,6 +37,8 @@ from sdc_taichi import (
 from sdc_taichi.cli.app import app
 from sdc_taichi.config.odd_values import odd_values
 from sdc_taichi.control import make_controller, view_maker
+from sdc_taichi.envs.core import REWARD_BEYOND_LIMITS
+from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
 from sdc_taichi.sim.fleet import build_fleet
@@ -174,13 +180,96 @@ def test_a_result_beyond_physics_ends_the_run_and_changes_nothing(
         assert sim.state is before
 
 
-def test_environments_end_at_a_limit_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LIMITS, "hvac_w", (-2.0, -1.0))
-    env = parallel_env("tiny", days=1)
-    env.reset(seed=0)
-    with pytest.raises(PhysicalLimitError, match=r"^tiny: hvac_w is .* in step 0; "):
-        env.step({agent: 0 for agent in env.agents})
+UNIT_DOWN = ["hvac.crac.coasting_flow_ratio=0.01", "servers.curve_limit_c=null",
+             "events.scheduled=[{kind: crac_down, start_h: 0.5, duration_h: 1}]"]  # fmt: skip
+RACK_3 = "{kind: rack_fan_failure, rack: 3, start_h: %g, duration_h: 0.5, share: 0.01}"
+
+FORMS: dict[str, Callable[..., Any]] = {
+    "single": partial(gymnasium.make, "sdc_taichi/Joint-v0"),
+    "parallel": parallel_env,
+    "aec": aec_env,
+    "batch": partial(gymnasium.make_vec, "sdc_taichi/Joint-v0", num_envs=1),
+    "batch SameStep": partial(
+        gymnasium.make_vec, "sdc_taichi/Joint-v0", num_envs=1, autoreset_mode="SameStep"
+    ),
+    "agents": partial(vector_env, 1),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_episode_terminates_at_a_limit(form: str) -> None:
+    overrides = [f"events.scheduled=[{RACK_3 % 0.25}]"]
+    env: Any = FORMS[form](config="corrected", days=1, overrides=overrides)
+    first: Any = env.reset(seed=0)
+    if form == "aec":
+        first = None, env.infos
+    infos = [first[1]]
+    ends: list[Any] = []
+    for _ in range(2):
+        if form == "aec":
+            for agent in list(env.agents):
+                env.step(env.action_space(agent).sample())
+            ends.append((env.rewards, env.terminations, env.truncations))
+            infos.append(env.infos)
+            continue
+        if form in ("parallel", "agents"):
+            actions = {a: env.action_space(a).sample() for a in env.agents}
+            if form == "agents":
+                actions = {a: np.array([action]) for a, action in actions.items()}
+        else:
+            actions = env.action_space.sample()
+        _, *end, info = env.step(actions)
+        ends.append(end)
+        infos.append(info)
+
+    def values(of: Any) -> set[float]:
+        return set(np.ravel([*of.values()] if isinstance(of, dict) else of).tolist())
+
+    assert all(values(end[1]) == values(end[2]) == {False} for end in ends[:1])
+    rewards, terminated, truncated = ends[1]
+    assert (values(rewards), values(terminated)) == ({REWARD_BEYOND_LIMITS}, {True})
+    assert values(truncated) == {False}
+    if form in ("parallel", "aec"):
+        infos = [info["agent_ls"] for info in infos]
+    if form == "batch SameStep":
+        infos[-1] = infos[-1]["final_info"]
+    reasons = [np.ravel(info["ended_by"]).tolist() for info in infos]
+    assert reasons == [[EndedBy.NOT_ENDED], [EndedBy.NOT_ENDED], [EndedBy.PHYSICAL_LIMITS]]
+    assert [*infos[0]] == [*infos[1]] == [*infos[2]]
+    env.reset(seed=1)
     env.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_one_episode_of_a_batch_terminates_and_the_others_go_on(mode: str) -> None:
+    good = load_config("corrected", ["name=a"])
+    bad = load_config("corrected", ["name=b", f"events.scheduled=[{RACK_3 % 0.25}]"])
+    actions = np.random.default_rng(0).integers(0, 3, (96, 3, 3))
+    runs = []
+    for configs in ([good, bad, good], [good, good, good]):
+        env = SdcVectorEnv(3, configs, days=1, autoreset_mode=mode)
+        seen = [env.reset(seed=5)[0]]
+        steps = [env.step(action) for action in actions]
+        seen += [step[0] for step in steps]
+        runs.append((np.array(seen), *(np.array([s[k] for s in steps]) for k in (1, 2, 3)), steps))
+        env.close()
+    (seen, rewards, terminated, truncated, steps), expected = runs
+    for ours, others in zip((seen, rewards, terminated, truncated), expected, strict=False):
+        np.testing.assert_array_equal(ours[:, [0, 2]], others[:, [0, 2]])
+    reasons = {"NextStep": [1], "SameStep": [1, 2], "Disabled": range(1, 96)}[mode]
+    assert np.flatnonzero(terminated[:, 1]).tolist() == [*reasons]
+    assert rewards[1, 1] == REWARD_BEYOND_LIMITS
+    assert truncated[-1].tolist() == [True, mode != "Disabled", True]
+    if mode == "NextStep":
+        assert rewards[2, 1] == 0.0
+    if mode == "SameStep":
+        info = steps[1][-1]
+        assert info["_final_obs"].tolist() == [False, True, False]
+        assert (info["final_obs"][0], info["final_obs"][1].shape) == (None, seen[0, 0].shape)
+        assert info["final_info"]["ended_by"][1] == EndedBy.PHYSICAL_LIMITS
+        assert info["ended_by"].tolist() == [0, 0, 0]
+    assert np.all(np.isfinite(seen))
+    assert np.all(np.isfinite(rewards))
 
 
 def test_servers_without_air_end_the_run() -> None:
@@ -235,11 +324,6 @@ def test_air_that_finds_no_steady_state_ends_the_run_in_a_step_that_is_named() -
         message = rf"^corrected: no steady .*{cause}.* \(step 1\)$"
         with pytest.raises(PhysicalLimitError, match=message):
             sim.step()
-
-
-UNIT_DOWN = ["hvac.crac.coasting_flow_ratio=0.01", "servers.curve_limit_c=null",
-             "events.scheduled=[{kind: crac_down, start_h: 0.5, duration_h: 1}]"]  # fmt: skip
-RACK_3 = "{kind: rack_fan_failure, rack: 3, start_h: %g, duration_h: 0.5, share: 0.01}"
 
 
 @pytest.mark.parametrize(

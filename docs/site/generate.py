@@ -100,8 +100,8 @@ API = (
             (
                 "sdc_taichi",
                 [
-                    *("vector_env", "parallel_env", "aec_env", "EnvOptions", "register_reward"),
-                    *("register_cost", "RecordEpisodes", "EpisodeRecorder"),
+                    *("vector_env", "parallel_env", "aec_env", "EnvOptions", "EndedBy"),
+                    *("register_reward", "register_cost", "RecordEpisodes", "EpisodeRecorder"),
                 ],
             )
         ],

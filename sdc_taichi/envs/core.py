@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,21 @@ Observation = F32 | dict[str, F32]
 of ``features``, (B, n), and ``heat_map``, (B, rows, racks per row, channels)."""
 
 
+REWARD_BEYOND_LIMITS = -1000.0
+"""Reward of every agent, and joint reward, of a step that ends an episode at a physical limit: that
+of a hundred steps with ten times the carbon of a step at the design point."""
+
+
+class EndedBy(IntEnum):
+    """Reason why an episode ended in a step: the values of ``info["ended_by"]``."""
+
+    NOT_ENDED = 0
+    LENGTH = 1
+    """The episode has its full length; it is truncated."""
+    PHYSICAL_LIMITS = 2
+    """A result is beyond the physical limits, or no steady air exists; the episode terminates."""
+
+
 @dataclass(slots=True)
 class Transition:
     """Result of one step of all environments."""
@@ -73,13 +89,28 @@ class Transition:
     """Costs of the step, (B,) each: ``cost_NAME`` for each cost of the option ``costs``, and their
     weighted sum ``cost``. The dict is empty without the option."""
     ended: bool
-    """True if this step ended the episodes, which all have the same length."""
+    """True if all episodes of the batch are over after this step."""
+    ended_by: I64
+    """Reason why each episode ended, as a value of ``EndedBy``, (B,)."""
     result: StepResult
     """Result of the simulator's step."""
+
+    @property
+    def terminated(self) -> npt.NDArray[np.bool_]:
+        """True for episodes that a physical limit has ended, (B,)."""
+        return self.ended_by == EndedBy.PHYSICAL_LIMITS
+
+    @property
+    def truncated(self) -> npt.NDArray[np.bool_]:
+        """True for episodes that ended because of their length, (B,)."""
+        return self.ended_by == EndedBy.LENGTH
 
 
 class Core:
     """A batch of data centers whose episodes begin and end together.
+
+    A physical limit ends the episode of a single data center earlier. ``restart_ended`` then starts
+    an episode of this data center that lasts until those of the batch end.
 
     Args:
         configs: configs of data centers; environment i uses config i modulo their number.
@@ -99,6 +130,8 @@ class Core:
         observation_spaces: observation space of each learning agent in one environment.
         action_spaces: action space of each learning agent in one environment.
         state_space: space of the shared state of one environment.
+        ended_early: True for environments whose episode has ended at a physical limit, and whose
+            next one has not begun, (B,).
 
     Raises:
         SdcError: a config, option or number is not valid.
@@ -124,7 +157,7 @@ class Core:
         self._inputs = DrawnInputs(by_env, options) if draws_inputs(options) else None
         self._draw: Draw | None = None
         first = None if self._inputs is None else self._inputs.first()
-        self.sim = Simulator(by_env, drivers=first, precision=precision)
+        self.sim = Simulator(by_env, drivers=first, precision=precision, limits="flag")
         fleet = self.sim.fleet
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
@@ -167,6 +200,7 @@ class Core:
         self._last: tuple[State, dict[str, F64]] | None = None
         self._final_terms: dict[str, F64] = {}
         self._keys: I64 = np.zeros(size, dtype=np.int64)
+        self.ended_early: npt.NDArray[np.bool_] = np.zeros(size, dtype=np.bool_)
         self._closed = False
         self._recordings: EpisodeRecordings | None = None
         self.record_episodes(recorder)
@@ -233,6 +267,7 @@ class Core:
     def _begin(self) -> None:
         """Reset controller, view, observer and rewards after a reset of the simulator."""
         self._final_terms = {}
+        self.ended_early = np.zeros(self.num_envs, dtype=np.bool_)
         self._others.reset(self.sim.state.seed)
         error = self.options.forecast_error
         if self._view_after is None or error != PERFECT:
@@ -241,6 +276,31 @@ class Core:
         self._view = view = self._view_after(None)
         self._observer.reset(view)
         self._rewards.reset(view)
+
+    def restart_ended(self) -> npt.NDArray[np.bool_]:
+        """Start the next episodes of the environments ``ended_early``, which end with the batch.
+
+        Their data centers have the state of the first step of the batch again; weather, demand,
+        events, and the memory of the controller ``others`` continue.
+
+        Returns:
+            True for these environments, (B,).
+        """
+        chosen = self.ended_early
+        if chosen.any():
+            last = self.view.last
+            self.sim.restart(chosen)
+            self.ended_early = np.zeros(self.num_envs, dtype=np.bool_)
+            self._view = self._view_after(last)
+            self._rewards.restart(chosen, self.view)
+        return chosen
+
+    def observe(self) -> dict[str, Observation]:
+        """Return the observations before the next step, by learning agent.
+
+        Those of environments that have just begun again contain results of the step before.
+        """
+        return self._observe(self.view)
 
     def record_episodes(self, recorder: RecorderOption) -> None:
         """Record selected episodes, starting with the next episode.
@@ -263,12 +323,19 @@ class Core:
         if self._recordings is not None:
             self._recordings.begin(self.sim)
 
-    def step(self, actions: Mapping[str, Any]) -> Transition:
+    def step(
+        self, actions: Mapping[str, Any], starting: npt.NDArray[np.bool_] | None = None
+    ) -> Transition:
         """Advance all environments by one step.
+
+        In the environments ``ended_early`` the actions are neutral and the rewards are 0, and they
+        stay terminated.
 
         Args:
             actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
                 the agent decides k values; continuous actions are floats, (B, k).
+            starting: True for environments of ``restart_ended`` that use this step as the reset of
+                their next episode, (B,): their actions are neutral and their rewards are 0.
 
         Raises:
             SdcError: the actions of an agent are missing or outside their space, or there are
@@ -278,6 +345,10 @@ class Core:
         view = self.view
         if self.episode_over:
             raise RuntimeStateError("the episode is over; call reset() first")
+        waiting = self.ended_early
+        idle = waiting if starting is None else waiting | starting
+        if idle.any():
+            actions = _with_idle(actions, self.idle_actions(), idle)
         commands = self._decoder.decode(actions, view.state)
         if self._commands_of_others:
             by_others = self._others.act(view)
@@ -289,12 +360,23 @@ class Core:
         self._last = (view.state, commands)
         self._view = view = self._view_after(result)
         rewards, joint_reward = self._rewards.rewards(result, view)
+        beyond = result.within_limits < 1.0
+        if idle.any() or beyond.any():
+            replaced = np.where(idle, 0.0, REWARD_BEYOND_LIMITS)
+            is_replaced = idle | beyond
+            rewards = {a: np.where(is_replaced, replaced, r) for a, r in rewards.items()}
+            joint_reward = np.where(is_replaced, replaced, joint_reward)
+            self.ended_early = waiting | (beyond & ~idle)
+        ended_by = np.where(self.ended_early, EndedBy.PHYSICAL_LIMITS, EndedBy.NOT_ENDED)
+        if view.state.step >= self.steps:
+            ended_by[~self.ended_early] = EndedBy.LENGTH
         transition = Transition(
             observations=self._observe(view),
             rewards=rewards,
             joint_reward=joint_reward,
             costs=self._costs.of(result, view),
             ended=self.episode_over,
+            ended_by=ended_by.astype(np.int64),
             result=result,
         )
         if self._recordings is not None and self._recordings.is_recording:
@@ -327,7 +409,9 @@ class Core:
     @property
     def episode_over(self) -> bool:
         """True if the episodes have ended and the next ones have not begun."""
-        return self._view is not None and self._view.state.step >= self.steps
+        if self._view is None:
+            return False
+        return self._view.state.step >= self.steps or bool(self.ended_early.all())
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
         """Return the neutral action of each learning agent, (B,) or (B, k)."""
@@ -347,17 +431,20 @@ class Core:
 
         Both have the same keys and types, because some libraries read the infos of a reset to know
         those of all steps: the start day and the drawn inputs of the current episodes, and
-        quantities and costs of the step. At a reset, quantities and costs are 0.
+        quantities and costs of the step, and ``ended_by``, a value of ``EndedBy``. At a reset, all
+        but the inputs are 0.
 
         Args:
             transition: result of the step; None after a reset.
         """
-        of_step: dict[str, F64]
+        of_step: dict[str, npt.NDArray[Any]]
         if transition is None:
             names = (*QUANTITIES_PER_DC, *self._costs.names)
             of_step = dict(zip(names, np.zeros((len(names), self.num_envs)), strict=True))
+            of_step["ended_by"] = np.zeros(self.num_envs, dtype=np.int64)
         else:
             of_step = {**transition.result.per_dc(), **transition.costs}
+            of_step["ended_by"] = transition.ended_by
         return {**self.start_info(), **of_step}
 
     def state(self) -> F32:
@@ -416,7 +503,9 @@ class Core:
             if saved.commands is not None:
                 # Repeat the last step, because its result is not part of the saved state.
                 self._last = (self.sim.state, saved.commands)
-                self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
+                result = self.sim.step(Actions(**saved.commands))
+                self.ended_early = result.within_limits < 1.0
+                self._view = self._view_after(result)
             self._rewards.load_peaks_kw(saved.peaks_kw)
             self._begin_recording()
         except BaseException:
@@ -460,6 +549,21 @@ class Core:
             starts = [c.site.start for c in self.sim.fleet.configs]
             return np.array([day_of_year(s) for s in starts], dtype=np.int64)
         return np.asarray(self._start_days[drawn % len(self._start_days)], dtype=np.int64)
+
+
+def _with_idle(
+    actions: Any, idle: Mapping[str, npt.NDArray[Any]], chosen: npt.NDArray[np.bool_]
+) -> Any:
+    """Replace the actions of chosen environments by idle ones; leave what is not valid as it is."""
+    if not isinstance(actions, Mapping):
+        return actions
+    replaced = dict(actions)
+    for agent, neutral in idle.items():
+        values = np.asarray(actions.get(agent))
+        if values.shape == neutral.shape and values.dtype.kind in "fiu":
+            replaced[agent] = values.copy()
+            replaced[agent][chosen] = neutral[chosen]
+    return replaced
 
 
 def _checked_size(num_envs: Any, configs: int) -> int:

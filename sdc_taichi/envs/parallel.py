@@ -24,9 +24,10 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
     """PettingZoo environment in which the learning agents of one data center act at the same time.
 
     Episodes end by truncation, because their length is a choice and a data center has no final
-    state. All agents have the same infos: ``start_day``, the randomly drawn inputs, the facility's
-    quantities of ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset``
-    have the same keys; quantities and costs are 0 there.
+    state; only a result beyond the physical limits terminates an episode. All agents have the same
+    infos: ``ended_by``, ``start_day``, the randomly drawn inputs, the facility's quantities of
+    ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset`` have the same
+    keys; ``ended_by``, quantities and costs are 0 there.
 
     Args:
         config: a preset, a file or a config.
@@ -96,8 +97,8 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         return (
             _first_of_each(transition.observations),
             as_scalars(transition.rewards),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, transition.ended),
+            dict.fromkeys(agents, bool(transition.terminated[0])),
+            dict.fromkeys(agents, bool(transition.truncated[0])),
             {agent: dict(info) for agent in agents},
         )
 

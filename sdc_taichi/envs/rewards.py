@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
@@ -132,6 +133,17 @@ class Rewards:
         self._context.reset(view)
         if self._released is not None:
             self._released.reset(view)
+
+    def restart(self, chosen: npt.NDArray[np.bool_], view: View) -> None:
+        """Forget the highest power of environments that start an episode within that of the batch.
+
+        Args:
+            chosen: True for these environments, (B,).
+            view: the view before the first step of their episodes.
+        """
+        billed_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
+        self._peak_before_kw = np.where(chosen, billed_kw, self._peak_before_kw)
+        self._peak_kw = np.where(chosen, billed_kw, self._peak_kw)
 
     def rewards(self, result: StepResult, view: View) -> tuple[dict[str, F64], F64]:
         """Compute the rewards of a step.

@@ -182,9 +182,10 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
     """Gymnasium environment of one data center with one learner.
 
     Episodes end by truncation, because their length is a choice and a data center has no final
-    state. Infos are ``start_day``, the randomly drawn inputs, the facility's quantities of
-    ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset`` have the same
-    keys; quantities and costs are 0 there.
+    state; only a result beyond the physical limits terminates an episode. Infos are ``ended_by``,
+    ``start_day``, the randomly drawn inputs, the facility's quantities of ``StepResult`` by name,
+    and the costs of the option ``costs``. Those of ``reset`` have the same keys; ``ended_by``,
+    quantities and costs are 0 there.
 
     Args:
         config: a preset, a file or a config.
@@ -243,7 +244,8 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         observation = first_of_batch(self._learner.observation(transition.observations))
         reward = float(self._learner.reward(transition)[0])
         info = as_scalars(self.core.infos(transition))
-        return observation, reward, False, transition.ended, info
+        terminated, truncated = bool(transition.terminated[0]), bool(transition.truncated[0])
+        return observation, reward, terminated, truncated, info
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
         """Continue from the ``state_dict`` of an environment with the same arguments.

@@ -42,7 +42,9 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Batch of data centers with one learner each, as created by ``gymnasium.make_vec``.
 
     Results equal those of Gymnasium's ``SyncVectorEnv`` of single environments. All episodes have
-    the same length and end, by truncation, in the same step. By default the next step starts new
+    the same length and end, by truncation, in the same step. Only a result beyond the physical
+    limits terminates an episode earlier; the next one of this environment then ends with those of
+    the batch. By default the next step starts new
     episodes: it ignores its actions and returns the first observations, rewards of 0 and the infos
     of ``reset``.
 
@@ -134,19 +136,33 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             RuntimeStateError: the environment has not been reset, or its episodes are over in mode
                 ``Disabled``.
         """
-        none = np.zeros(self.num_envs, dtype=np.bool_)
-        if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
-            observation, infos = self.reset()
-            return observation, np.zeros(self.num_envs), none, none.copy(), infos
-        transition = self.core.step(self._learner.actions(actions))
+        starting = None
+        if self._mode is AutoresetMode.NEXT_STEP:
+            if self.core.episode_over:
+                observation, infos = self.reset()
+                none = np.zeros(self.num_envs, dtype=np.bool_)
+                return observation, np.zeros(self.num_envs), none, none.copy(), infos
+            starting = self.core.restart_ended()
+        transition = self.core.step(self._learner.actions(actions), starting)
         observation = self._learner.observation(transition.observations)
         infos = self._infos(self.core.infos(transition))
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             final = {"final_obs": self._one_by_one(observation), "final_info": infos}
             observation = self._learner.observation(self.core.next_episode())
             infos = self._infos({**final, **self.core.infos()})
-        ended = np.full(self.num_envs, transition.ended)
-        return observation, self._learner.reward(transition), none, ended, infos
+        elif self._mode is AutoresetMode.SAME_STEP and self.core.ended_early.any():
+            last = self._one_by_one(observation)
+            begun = self.core.restart_ended()
+            last[~begun] = None
+            infos = self._infos(_begun_again(self.core.infos(transition), self.core, begun)) | {
+                "final_obs": last,
+                "_final_obs": begun,
+                "final_info": infos,
+                "_final_info": begun,
+            }
+            observation = self._learner.observation(self.core.observe())
+        reward = self._learner.reward(transition)
+        return observation, reward, transition.terminated, transition.truncated, infos
 
     @property
     def features(self) -> tuple[Feature, ...]:
@@ -230,9 +246,10 @@ class RecordEpisodes(_VectorWrapper):
 class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
     """Batch of data centers with several learning agents each.
 
-    All episodes have the same length and end, by truncation, in the same step. By default the next
-    step starts new episodes: it ignores its actions and returns the first observations and rewards
-    of 0.
+    All episodes have the same length and end, by truncation, in the same step. Only a result beyond
+    the physical limits terminates an episode earlier, for all agents of that environment; its next
+    episode then ends with those of the batch. By default the next step starts new episodes: it
+    ignores its actions and returns the first observations and rewards of 0.
 
     Args:
         num_envs: number of environments; None creates one per config.
@@ -246,7 +263,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
     Attributes:
         num_envs: number of environments, B.
         possible_agents: names of the learning agents. ``agents`` is always the same list, because
-            agents never leave an episode early.
+            no agent leaves an episode before the others.
         observation_spaces: observation space of one environment, by agent.
         action_spaces: action space of one environment, by agent.
         state_space: space of the shared state of one environment.
@@ -336,33 +353,41 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
             RuntimeStateError: the environment has not been reset, or its episodes are over in mode
                 ``Disabled``.
         """
-        if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
-            first, begun = self.reset()
-            return (
-                first,
-                {agent: np.zeros(self.num_envs, dtype=np.float32) for agent in self.agents},
-                self._flags(False),
-                self._flags(False),
-                begun,
-            )
-        transition = self.core.step(actions)
+        starting = None
+        if self._mode is AutoresetMode.NEXT_STEP:
+            if self.core.episode_over:
+                first, begun = self.reset()
+                none = np.zeros(self.num_envs, dtype=np.bool_)
+                return (
+                    first,
+                    {agent: np.zeros(self.num_envs, dtype=np.float32) for agent in self.agents},
+                    self._flags(none),
+                    self._flags(none),
+                    begun,
+                )
+            starting = self.core.restart_ended()
+        transition = self.core.step(actions, starting)
         observations = transition.observations
         infos: dict[str, Any] = self.core.infos(transition)
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
             infos |= self.core.start_info()
+        elif self._mode is AutoresetMode.SAME_STEP and self.core.ended_early.any():
+            infos["final_obs"], infos["final_state"] = observations, self.core.state()
+            self.core.restart_ended()
+            observations = self.core.observe()
         return (
             observations,
             {agent: reward.astype(np.float32) for agent, reward in transition.rewards.items()},
-            self._flags(False),
-            self._flags(transition.ended),
+            self._flags(transition.terminated),
+            self._flags(transition.truncated),
             infos,
         )
 
-    def _flags(self, value: bool) -> dict[str, Flags]:
-        """Return arrays that repeat one flag for all environments, (B,), by agent."""
-        return {agent: np.full(self.num_envs, value) for agent in self.agents}
+    def _flags(self, of_envs: Flags) -> dict[str, Flags]:
+        """Return a copy of the flags of all environments, (B,), by agent."""
+        return {agent: of_envs.copy() for agent in self.agents}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Continue from the ``state_dict`` of a batch with the same arguments.
@@ -377,6 +402,12 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
 
 
 vector_env = MultiAgentVectorEnv
+
+
+def _begun_again(values: Mapping[str, Any], core: Core, begun: Flags) -> dict[str, Any]:
+    """Replace infos of a step by those of a reset for environments that have begun again."""
+    first = core.infos()
+    return {name: np.where(begun, first[name], value) for name, value in values.items()}
 
 
 def _autoreset_mode(mode_name: AutoresetMode | str) -> AutoresetMode:

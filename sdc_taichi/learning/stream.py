@@ -153,11 +153,14 @@ class EnvironmentStream:
             Observations after the last step, and rewards summed over the steps.
         """
         core, by_agent = self._core, self._by_agent(actions)
+        # Episodes that ended at a physical limit begin again; the others are not affected.
+        core.restart_ended()
         transition = core.step(by_agent)
         by_learner, team = self._rewards(transition)
         for _ in range(self.decision_steps - 1):
             if transition.ended:
                 break
+            core.restart_ended()
             transition = core.step(by_agent)
             more, more_of_team = self._rewards(transition)
             by_learner = {name: by_learner[name] + more[name] for name in by_learner}

@@ -24,12 +24,15 @@ from sdc_taichi.types import F64, State, fields_of
 J_PER_KWH = 3.6e6
 _AXES = {"unit": "U", "rack": "R"}
 """Axes of the fields of ``HallSums`` by the first part of their names; those of others are B."""
-_STATE_AXES = {
+STATE_AXES = {
+    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh"), "B"),
+    **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
+    **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),
     **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
     **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
     **dict.fromkeys(("need_m3s", "following", "supply_excess_k"), "U"),
 }
-"""Axes of the temperatures in ``State``."""
+"""First axes of the fields of ``State``, except its seeds and its clock."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))
 _EMPTY = np.zeros(0)
 
@@ -226,7 +229,7 @@ def held_air(
     }
     values["room_j"] = np.where(beyond, state.room_heat_kwh * J_PER_KWH, values["room_j"])
     after = {
-        name: np.where(of_axis[_STATE_AXES[name]], getattr(state, name), value)
+        name: np.where(of_axis[STATE_AXES[name]], getattr(state, name), value)
         if len(value)
         else value
         for name, value in thermal.items()

@@ -15,7 +15,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.air import held_air, plain_supply_air
+from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
@@ -84,6 +84,8 @@ class Simulator:
         )
         self._stages: Stages | None = None
         self._state: State | None = None
+        # State before the first step of the run; None if it has to be computed.
+        self._first_state: State | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         if self._stages is not None:
@@ -162,6 +164,7 @@ class Simulator:
             )
         inputs = replace(inputs, start=first.astype(np.int64))
         self.continue_from(self._initial_state(seeds, inputs), inputs)
+        self._first_state = self._state
         self._initial_start = initial
         return self.state
 
@@ -365,10 +368,37 @@ class Simulator:
         """
         inputs = self.drivers if drivers is None else self._checked_drivers(drivers)
         self._started().hall.discard_last_step()
-        self._last_air = self._beyond = None
+        self._last_air = self._beyond = self._first_state = None
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
         self._drivers = replace(inputs, start=state.start)
+
+    def restart(self, chosen: npt.NDArray[np.bool_]) -> None:
+        """Give some data centers the state that they had before the first step of the run.
+
+        The clock goes on: weather, demand and events continue for all data centers.
+
+        Args:
+            chosen: True for these data centers, (B,).
+        """
+        state, fleet = self.state, self.fleet
+        if self._first_state is None:
+            self._first_state = self._initial_state(state.seed, self.drivers)
+        racks = chosen[fleet.rack_dc]
+        rows = {
+            "B": chosen,
+            "U": chosen[fleet.unit_dc],
+            "R": racks,
+            "G": np.repeat(racks, np.diff(fleet.group_offsets)),
+        }
+        values = {}
+        for name, axis in STATE_AXES.items():
+            now, first = getattr(state, name), getattr(self._first_state, name)
+            if len(now):
+                at = rows[axis].reshape(-1, *[1] * (now.ndim - 1))
+                values[name] = np.where(at, first, now)
+        values["queue"].flags.writeable = False
+        self._state = replace(state, **values)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the current state to an .npz file, atomically and without pickle.
@@ -402,7 +432,7 @@ class Simulator:
         """Release state, inputs and kernel arrays; a closed simulator keeps only its ``fleet``."""
         if self._stages is not None:
             self._stages.workload.close()
-        self._stages = self._state = self._drivers = self._last_air = None
+        self._stages = self._state = self._drivers = self._last_air = self._first_state = None
 
     def __enter__(self) -> Self:
         return self
