@@ -23,7 +23,7 @@ from pettingzoo.test.state_test import state_test
 
 import sdc_taichi
 from eventful_hall import EVENTFUL_HALL
-from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
+from sdc_taichi import ConfigError, EndedBy, RuntimeStateError, SdcError, load_config
 from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs import IDS, images
 from sdc_taichi.envs.agents import AGENTS
@@ -486,14 +486,15 @@ def test_infos_are_quantities_of_the_step() -> None:
     env.reset(seed=0)
     *_, infos = env.step(dict.fromkeys(AGENTS, np.array([1, 1])))
     view = env.core.view
-    assert infos.keys() == {"start_day", *view.last.per_dc()}
+    assert infos.keys() == {"start_day", "ended_by", *view.last.per_dc()}
     assert np.array_equal(infos["carbon_g"], view.last.carbon_g)
     assert np.all(infos["it_kwh"] > 0)
     assert env.reward_terms().keys() == TERMS.keys()
     single = SdcEnv(**tiny())
     day = single.reset(seed=0)[1]["start_day"]
     *_, info = single.step(np.array([1, 1, 1]))
-    assert info == {"start_day": day} | {n: infos[n][0] for n in view.last.per_dc()}
+    first = {"start_day": day, "ended_by": EndedBy.NOT_ENDED}
+    assert info == first | {n: infos[n][0] for n in view.last.per_dc()}
 
 
 INTERFACES: dict[str, Callable[..., Any]] = {

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.spaces import Box, MultiDiscrete
 from gymnasium.utils.env_checker import check_env
 
+import random_actions
 import sdc_taichi
 from sdc_taichi import ConfigError, load_config
 from sdc_taichi.envs.actions import PLACEMENT_FACTOR
@@ -198,3 +199,10 @@ def test_placement_needs_halls_of_as_many_racks() -> None:
     )
     with pytest.raises(ConfigError, match=r"same number of racks; it is \[20, 4\]"):
         sdc_taichi.vector_env(config=[large, small], commands={"agent_ls": ["placement"]})
+
+
+@pytest.mark.parametrize(("preset", "kind"), list(random_actions.cases()))
+def test_random_actions_of_every_kind_stop_no_batch(preset: str, kind: str) -> None:
+    envs, steps = (2, 4) if preset == "large" else (16, 50)
+    ended = random_actions.play(preset, kind, envs, steps)
+    assert ended["length"] == 0

@@ -483,8 +483,7 @@ class Core:
 
         Raises:
             SdcError: the state belongs to other environments, is incomplete or is not valid; the
-                environments are then unchanged. The error is also raised if no step is possible
-                from the state; the environments then need ``reset``.
+                environments are then unchanged.
         """
         self._check_open()
         saved = check_state(
