@@ -57,10 +57,8 @@ def play(
         trace.write_text("cpu_load\n" + f"{demand}\n" * 8760)
         overrides = overrides | {"site.workload_file": str(trace)}
         warnings.simplefilter("ignore", OddInputWarning)
-        env = vector_env(
-            envs, preset, days=7, overrides=overrides, **options,
-            **({"commands": commands} if commands else {}),
-        )  # fmt: skip
+        arguments = options | ({"commands": commands} if commands else {})
+        env = vector_env(envs, preset, days=7, overrides=overrides, **arguments)
     env.reset(seed=seed)
     spaces = env.action_spaces
     for _ in range(steps):

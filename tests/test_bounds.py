@@ -245,13 +245,14 @@ def test_one_episode_of_a_batch_terminates_and_the_others_go_on(mode: str) -> No
     good = load_config("corrected", ["name=a"])
     bad = load_config("corrected", ["name=b", f"events.scheduled=[{RACK_3 % 0.25}]"])
     actions = np.random.default_rng(0).integers(0, 3, (96, 3, 3))
-    runs = []
+    runs: list[Any] = []
     for configs in ([good, bad, good], [good, good, good]):
         env = SdcVectorEnv(3, configs, days=1, autoreset_mode=mode)
-        seen = [env.reset(seed=5)[0]]
-        steps = [env.step(action) for action in actions]
-        seen += [step[0] for step in steps]
-        runs.append((np.array(seen), *(np.array([s[k] for s in steps]) for k in (1, 2, 3)), steps))
+        first: Any = env.reset(seed=5)[0]
+        played = [env.step(action) for action in actions]
+        observed = np.array([first, *(each[0] for each in played)])
+        flags = (np.array([each[k] for each in played]) for k in (1, 2, 3))
+        runs.append((observed, *flags, played))
         env.close()
     (seen, rewards, terminated, truncated, steps), expected = runs
     for ours, others in zip((seen, rewards, terminated, truncated), expected, strict=False):

@@ -181,7 +181,7 @@ def test_a_state_from_which_no_step_is_physical_ends_the_episodes() -> None:
     state = env.state_dict()
     for name in ("server_c", "mixed_c"):
         state["simulator"][name][:] = 1e6
-    seen = env.load_state_dict(state)
+    seen: Any = env.load_state_dict(state)
     assert all(np.all(np.isfinite(values)) for values in seen.values())
     assert env.core.episode_over
     play(env, 1)  # It starts the next episodes.

@@ -98,12 +98,12 @@ class Transition:
     @property
     def terminated(self) -> npt.NDArray[np.bool_]:
         """True for episodes that a physical limit has ended, (B,)."""
-        return self.ended_by == EndedBy.PHYSICAL_LIMITS
+        return np.asarray(self.ended_by == EndedBy.PHYSICAL_LIMITS)
 
     @property
     def truncated(self) -> npt.NDArray[np.bool_]:
         """True for episodes that ended because of their length, (B,)."""
-        return self.ended_by == EndedBy.LENGTH
+        return np.asarray(self.ended_by == EndedBy.LENGTH)
 
 
 class Core:
