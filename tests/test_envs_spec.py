@@ -138,7 +138,11 @@ def test_fewer_steps_than_the_days_have() -> None:
         )
         for mode in (None, "sync")
     ]
-    assert data_equivalence(played(given[0], 25), played(given[1], 25), exact=True)
+    # Gymnasium ends episodes of single environments from outside, so they do not know of it.
+    batch, single = played(given[0], 25), played(given[1], 25)
+    for *_, infos in (*batch, *single):
+        del infos["ended_by"]
+    assert data_equivalence(batch, single, exact=True)
     assert given[0].spec.max_episode_steps == 10
     assert gymnasium.make_vec(given[0].spec).spec.max_episode_steps == 10  # type: ignore[union-attr]
     no_limit: Any = gymnasium.make_vec(

@@ -46,7 +46,7 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ("a: 1\n---\nb: 2\n", ["not valid YAML", "single document"]),
         ("!!python/object:os.system {}", ["not valid YAML", "python/object"]),
         ("extends: corected", ["extends: 'corected'", "corrected, hall_of_2026, large, paper"]),
-        ("extends: ./other.yaml", ["extends: './other.yaml'", "other.yaml' is no file"]),
+        ("extends: ./other.yaml", ["extends: './other.yaml'", "is no file"]),
         ("extends: .", ["extends: '.'", "is no file", "valid is a preset"]),
         ("extends: [tiny]", ["extends: ['tiny'] is no name", "valid is a preset"]),
         ("hall: {rows: 2}", ["hall.racks_per_row: missing", "hall.supply_approach_k: missing"]),

@@ -10,7 +10,16 @@ import pandas as pd
 import pytest
 
 from made_studies import ROWS, done_job, frames_of_row, write_study
-from published import FIGURES, FOLDER, SUITES, cells, described, suite_of, tolerance
+from published import (
+    CHANGED_SINCE,
+    FIGURES,
+    FOLDER,
+    SUITES,
+    cells,
+    described,
+    suite_of,
+    tolerance,
+)
 from sdc_taichi import make_controller
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.store import ResultStore
@@ -61,6 +70,8 @@ def test_cells_are_reached_again(suite: str) -> None:
     for (name, cell), reached in zip(cell_of.items(), rows.to_dict("records"), strict=True):
         limit = tolerance(name, published)
         for figure in FIGURES:
+            if (suite, figure) in CHANGED_SINCE:
+                continue
             assert reached[figure] == pytest.approx(cell[figure], rel=limit), (name, figure)
         if solved:
             assert reached["share"] == pytest.approx(cell["share"], abs=100 * limit), name

@@ -445,7 +445,7 @@ def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
         load_json(text)  # refuses numbers that are not finite, and keys that exist twice
     except ValidationError as error:
         with contextlib.suppress(ValueError):
-            values = load_json(text)
+            values = json.loads(text)
         raise ConfigError(explain(error, str(path), model, values)) from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
