@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+import sdc_taichi.learning
 from sdc_taichi import EnvOptions
 from sdc_taichi.cli import train as train_command
 from sdc_taichi.cli.app import app
@@ -136,6 +137,8 @@ def test_errors_of_the_command_are_one_line(arguments: list[str], said: str) -> 
 @pytest.fixture
 def without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
+    # Other tests of this process may have imported it already.
+    monkeypatch.delitem(vars(sdc_taichi.learning), "train", raising=False)
 
 
 @pytest.mark.usefixtures("without_torch")
