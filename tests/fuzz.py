@@ -55,7 +55,7 @@ class Verdict(NamedTuple):
     outcome: str
     """``ran``, ``refused`` or ``failed``."""
     text: str
-    """What was hostile, and how the case failed."""
+    """Description of the hostile input, and of the failure if the case failed."""
     seconds: float
 
 

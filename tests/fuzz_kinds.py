@@ -63,7 +63,7 @@ class Case:
     """One hostile input: it must end in a correct run, or in an ``SdcError`` of one line."""
 
     about: str
-    """What is hostile, printed if the case fails."""
+    """Description of the hostile input, printed if the case fails."""
     run: Callable[[], object]
     """Use the input; raise an ``SdcError`` if it is refused."""
     must_refuse: bool = False
@@ -263,7 +263,7 @@ def import_paths(rng: Generator, folder: Path) -> Case:
     return Case(f"{path!r} in {place}", lambda: command(*places[place](path)), must_refuse=True)
 
 
-# Results of others
+# Result folders from foreign sources
 
 
 @of_worker
@@ -811,7 +811,8 @@ def actions(rng: Generator, folder: Path) -> Case:
             except SdcError as error:
                 if accepted or "\n" in str(error):
                     raise AssertionError(f"{name} actions are refused") from error
-                if form == "aec":  # It keeps the refused actions of the agents before the last.
+                # PettingZoo's AEC environment keeps refused actions of the agents that acted first.
+                if form == "aec":
                     env.reset(seed=0)
             else:
                 assert accepted, f"{name} actions are accepted"

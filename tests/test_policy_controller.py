@@ -222,7 +222,7 @@ def test_a_policy_runs_no_code_that_its_file_names(tmp_path: Path) -> None:
     [
         (["a"], 1, "its training had this policy for others"),
         (["a", "../x/b"], 2, "its training had this policy for others"),
-        ([*"abcdefghijkl"], 8, "is that of others in 8 trainings, one within the other"),
+        ([*"abcdefghijkl"], 8, "it is nested in 8 policies, each of which names the next"),
     ],
 )
 def test_policies_for_others_end(

@@ -131,7 +131,7 @@ def refused(error: pytest.ExceptionInfo[SdcError], what: str, name: str) -> bool
 def test_a_forged_cell_is_refused_by_all_users(
     study: Path, tmp_path: Path, what: str, name: str, forge: Forge
 ) -> None:
-    # The report of a folder of others.
+    # ``report`` reads a folder with a forged cell.
     target = Path(shutil.copytree(study, tmp_path / "target"))
     store = ResultStore(target)
     of_row = done_job("g36", 0, frames_of_row("g36", 0), spec=ROWS["g36"])
@@ -141,7 +141,7 @@ def test_a_forged_cell_is_refused_by_all_users(
         with pytest.raises(SdcError) as raised:
             write_report([target], **{output: tmp_path / f"report.{output}"})
         assert refused(raised, what, name)
-    # A row of others.
+    # ``add`` reads a submitted row with a forged cell.
     row = tmp_path / "row"
     write_submission(row, {0: frame_of(0.05)}, suite="made-up", case="two-sites", row="theirs",
                      kind="controller", author="a")  # fmt: skip

@@ -184,7 +184,8 @@ def test_a_state_from_which_no_step_is_physical_ends_the_episodes() -> None:
     seen: Any = env.load_state_dict(state)
     assert all(np.all(np.isfinite(values)) for values in seen.values())
     assert env.core.episode_over
-    play(env, 1)  # It starts the next episodes.
+    # The step after an end starts the next episodes.
+    play(env, 1)
     assert not env.core.episode_over
 
 

@@ -236,7 +236,7 @@ class _Problem:
     where: str
     """Dotted path of the key."""
     text: str
-    """What would be valid."""
+    """Rule that the value breaks, such as "should be at least 1"."""
     got: str
     """The value in brackets, and a hint; empty if the value is missing or a section."""
     is_wrong_kind: bool

@@ -24,9 +24,11 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F32, I64, Actions
 
 _MOST_NESTED = 8
-"""Maximum number of policies of which each is the controller of others in the previous one."""
+"""Maximum depth of nested policies: a policy may control the agents ``others`` in the training of
+another policy, which does the same in a third one, and so on."""
 _loading: list[Path] = []
-"""Folders of the policies that are being made, each for the others of the previous one."""
+"""Folders of the policies that are being loaded; each policy after the first is named as
+controller ``others`` by the policy before it."""
 
 
 class PolicyController:
@@ -145,8 +147,8 @@ def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> Policy
         raise ConfigError(f"policy {text}: its training had this policy for others")
     if len(_loading) == _MOST_NESTED:
         raise ConfigError(
-            f"policy {text}: is that of others in {_MOST_NESTED} trainings, one within the other; "
-            "valid are fewer"
+            f"policy {text}: it is nested in {_MOST_NESTED} policies, each of which names the next "
+            f"as its controller others; valid is a depth of up to {_MOST_NESTED}"
         )
     # If the spec names further controllers, the policy sets only the commands of its agents.
     others = None if set(parts) == set(CONTROLLABLE) else "idle"

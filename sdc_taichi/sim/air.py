@@ -23,7 +23,8 @@ from sdc_taichi.types import F64, State, fields_of
 
 J_PER_KWH = 3.6e6
 _AXES = {"unit": "U", "rack": "R"}
-"""Axes of the fields of ``HallSums`` by the first part of their names; those of others are B."""
+"""Axes of the fields of ``HallSums`` by the first part of their names; all other fields have one
+entry per data center, B."""
 STATE_AXES = {
     **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh"), "B"),
     **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
@@ -216,25 +217,42 @@ def held_air(
     Returns:
         Results and temperatures; those of the other data centers are unchanged.
     """
-    racks = beyond[fleet.rack_dc]
-    of_axis = {
-        "B": beyond,
-        "U": beyond[fleet.unit_dc],
+    axes = {name: _axis(name) for name in fields_of(air)}
+    values = with_entries_of(last, fields_of(air), beyond, axes, fleet)
+    values["room_j"] = np.where(beyond, state.room_heat_kwh * J_PER_KWH, values["room_j"])
+    return HallSums(**values), with_entries_of(state, thermal, beyond, STATE_AXES, fleet)
+
+
+def with_entries_of(
+    source: Any,
+    values: Mapping[str, Any],
+    chosen: npt.NDArray[np.bool_],
+    axes: Mapping[str, str],
+    fleet: Fleet,
+) -> dict[str, Any]:
+    """Replace the entries of chosen data centers by those of another object.
+
+    Args:
+        source: Object with the replacing values as attributes.
+        values: Arrays by name; empty arrays stay empty.
+        chosen: True for these data centers, (B,).
+        axes: First axis of each array by name: ``B``, ``U``, ``R`` or ``G`` for entries of data
+            centers, CRAC units, racks or server groups.
+        fleet: The data centers.
+    """
+    racks = chosen[fleet.rack_dc]
+    is_chosen = {
+        "B": chosen,
+        "U": chosen[fleet.unit_dc],
         "R": racks,
         "G": np.repeat(racks, np.diff(fleet.group_offsets)),
     }
-    values = {
-        name: np.where(of_axis[_axis(name)], getattr(last, name), value)
-        for name, value in fields_of(air).items()
-    }
-    values["room_j"] = np.where(beyond, state.room_heat_kwh * J_PER_KWH, values["room_j"])
-    after = {
-        name: np.where(of_axis[STATE_AXES[name]], getattr(state, name), value)
-        if len(value)
-        else value
-        for name, value in thermal.items()
-    }
-    return HallSums(**values), after
+    replaced = dict(values)
+    for name, value in values.items():
+        if len(value):
+            at = is_chosen[axes[name]].reshape(-1, *[1] * (value.ndim - 1))
+            replaced[name] = np.where(at, getattr(source, name), value)
+    return replaced
 
 
 def _axis(name: str) -> str:

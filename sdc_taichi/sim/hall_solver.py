@@ -270,10 +270,7 @@ class Hall:
                 ``flags_limits`` is False.
             SdcError: A condition is not finite or has the wrong shape.
         """
-        self._set_conditions(conditions)
-        self._unit_state["fresh_ratio"][:] = 1.0
-        self._dc["fan_speed"][:] = 1.0
-        self._begin_step(exchanges_before=0)
+        self._begin_steady_step(conditions)
         dc_out = self._new_results()
         self.beyond_limits = None
         if not self._recirculates:
@@ -524,6 +521,13 @@ class Hall:
         warmed_k = (coil.room_j / coil.room_j_per_k)[self._fleet.unit_dc]
         self._unit_state["supply_c"][:] = coil.setpoint_c + warmed_k + excess_k
 
+    def _begin_steady_step(self, conditions: Conditions) -> None:
+        """Set the conditions of a step in steady air, where CRAC units first cover all need."""
+        self._set_conditions(conditions)
+        self._unit_state["fresh_ratio"][:] = 1.0
+        self._dc["fan_speed"][:] = 1.0
+        self._begin_step(exchanges_before=0)
+
     def _begin_step(self, exchanges_before: int) -> None:
         """Reset the control rows of the kernel for a new step.
 
@@ -586,9 +590,7 @@ class Hall:
         for share, load in product(SUPPLY_SHARES, loads):
             supply_c = low_c + share * (high_c - low_c)
             conditions = Conditions(supply_c[fleet.unit_dc], np.full(fleet.size, load))
-            self._set_conditions(conditions)
-            self._unit_state["fresh_ratio"][:] = 1.0
-            self._begin_step(exchanges_before=0)
+            self._begin_steady_step(conditions)
             self._control["status"][others] = DONE
             if self._sample is not None:
                 self._solve_sampled_racks(self._sample, conditions)
@@ -620,7 +622,8 @@ class Hall:
         sample = Hall(sampled_fleet(fleet, self._sparse_dcs, modes), precision)
         sample._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
         if tables.group_places * LANES > SERIAL_GROUPS:
-            # Where the hall needs threads, its sampled racks use the same compiled kernel.
+            # A hall that runs on several threads and its sampled racks, which would run on one,
+            # then share one compiled kernel, which shortens the start.
             sample._serial_groups = 0
         array, rows = build_steady_states(fleet, self._places, self._dtype, modes)
         dc_ints = tables.rows("dc_ints")
@@ -637,9 +640,7 @@ class Hall:
         """Solve the sampled racks of sparse halls, from whose outlets their sweeps start."""
         dcs = self._sparse_dcs
         supply_c = conditions.unit_supply_c[self._fleet.unit_offsets[dcs]]
-        sample._set_conditions(Conditions(supply_c, conditions.utilisation[dcs]))
-        sample._unit_state["fresh_ratio"][:] = 1.0
-        sample._begin_step(exchanges_before=0)
+        sample._begin_steady_step(Conditions(supply_c, conditions.utilisation[dcs]))
         sample._run_sweeps(np.empty((len(DC_OUT), len(dcs))), SAMPLE_SWEEPS)
         self._dc["feedback_gain"][dcs] = sample._dc["feedback_gain"]
         status = sample._control["status"]

@@ -15,7 +15,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air
+from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air, with_entries_of
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
@@ -381,22 +381,11 @@ class Simulator:
         Args:
             chosen: True for these data centers, (B,).
         """
-        state, fleet = self.state, self.fleet
+        state = self.state
         if self._first_state is None:
             self._first_state = self._initial_state(state.seed, self.drivers)
-        racks = chosen[fleet.rack_dc]
-        rows = {
-            "B": chosen,
-            "U": chosen[fleet.unit_dc],
-            "R": racks,
-            "G": np.repeat(racks, np.diff(fleet.group_offsets)),
-        }
-        values = {}
-        for name, axis in STATE_AXES.items():
-            now, first = getattr(state, name), getattr(self._first_state, name)
-            if len(now):
-                at = rows[axis].reshape(-1, *[1] * (now.ndim - 1))
-                values[name] = np.where(at, first, now)
+        now = {name: getattr(state, name) for name in STATE_AXES}
+        values = with_entries_of(self._first_state, now, chosen, STATE_AXES, self.fleet)
         values["queue"].flags.writeable = False
         self._state = replace(state, **values)
 
