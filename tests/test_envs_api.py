@@ -551,8 +551,11 @@ def infos_of_steps(env: Any, steps: int) -> list[dict[str, Any]]:
         *_, truncated, infos = env.step(actions)
         add(infos)
         over = np.all(list(truncated.values()) if isinstance(truncated, dict) else truncated)
-        mode = getattr(env, "metadata", {}).get("autoreset_mode", AutoresetMode.DISABLED)
-        if over and mode is AutoresetMode.DISABLED:
+        # Old versions of Gymnasium write the mode of a vector environment into its environments' own.
+        resets_itself = hasattr(env, "num_envs") and (
+            env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED
+        )
+        if over and not resets_itself:
             add(env.reset()[1])
     return out
 
