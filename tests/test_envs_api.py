@@ -551,7 +551,7 @@ def infos_of_steps(env: Any, steps: int) -> list[dict[str, Any]]:
         *_, truncated, infos = env.step(actions)
         add(infos)
         over = np.all(list(truncated.values()) if isinstance(truncated, dict) else truncated)
-        # Old versions of Gymnasium write the mode of a vector environment into its environments' own.
+        # Old versions of Gymnasium write a vector environment's mode into its environments, too.
         resets_itself = hasattr(env, "num_envs") and (
             env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED
         )

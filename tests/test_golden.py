@@ -1,4 +1,4 @@
-"""Presets, environments, policies and an optimum against digests of the version before."""
+"""Presets of the paper and its code keep their results to the bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,3 @@ def test_results_keep_their_bits(name: str) -> None:
     expected = GOLDEN["cases"][name]
     # A new quantity of a result has no digest in the file.
     assert {quantity: digests.get(quantity) for quantity in expected} == expected
-
-
-def test_optimum_keeps_its_figures() -> None:
-    assert golden.same_optimum(golden.optimum(), GOLDEN["optimum"])

@@ -11,10 +11,10 @@ import pytest
 
 from made_studies import ROWS, done_job, frames_of_row, write_study
 from published import (
-    CHANGED_SINCE,
     FIGURES,
     FOLDER,
     SUITES,
+    WAITING,
     cells,
     described,
     suite_of,
@@ -48,6 +48,8 @@ def test_suites_are_still_those_that_were_published(suite: str) -> None:
 def test_cells_are_reached_again(suite: str) -> None:
     if not (FOLDER / suite).is_dir():
         pytest.skip(f"suite {suite} is not published")
+    if suite in WAITING:
+        pytest.skip(f"suite {suite} waits to be published again: its models have changed")
     published, cell_of = described(suite), cells(suite)
     case = suite_of(suite).cases[published["case"]]
     site, week = cell_of["idle"]["site"], cell_of["idle"]["week"]
@@ -70,8 +72,6 @@ def test_cells_are_reached_again(suite: str) -> None:
     for (name, cell), reached in zip(cell_of.items(), rows.to_dict("records"), strict=True):
         limit = tolerance(name, published)
         for figure in FIGURES:
-            if (suite, figure) in CHANGED_SINCE:
-                continue
             assert reached[figure] == pytest.approx(cell[figure], rel=limit), (name, figure)
         if solved:
             assert reached["share"] == pytest.approx(cell["share"], abs=100 * limit), name

@@ -7,7 +7,7 @@ import io
 import pandas as pd
 import pytest
 
-from published import cells, described, suite_of, tolerance
+from published import WAITING, cells, described, suite_of, tolerance
 from sdc_taichi.benchmark.jobs import run_job
 from sdc_taichi.benchmark.suite_run import row_jobs
 
@@ -20,6 +20,8 @@ SUITE, ROW, TORCH = "small", "ippo", "2.13.0"
 
 
 def test_a_training_reaches_what_was_published() -> None:
+    if SUITE in WAITING:
+        pytest.skip(f"suite {SUITE} waits to be published again: its models have changed")
     published, cell_of = described(SUITE), cells(SUITE)
     (job, *_) = row_jobs(suite_of(SUITE).chosen(rows=[ROW]), ())
     done = run_job(job, {})
