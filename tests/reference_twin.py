@@ -433,6 +433,10 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     crac_m3s = config.hvac.crac.supply_m3s_per_w * float(it_w.sum())
     bypassed = max(0.0, 1.0 - float(((1.0 - share) * airflow).sum()) / crac_m3s)
     is_open = 1.0 - hall.layout.containment
+    if hall.recirculation.approach_of == "hall" or (
+        hall.recirculation.approach_of is None and scaled_to == "rack"
+    ):
+        is_open = 1.0
     captured = is_open * share[rack] * height
     for _ in range(60):
         inlet_c = supply_c + (weights @ rise)[rack] * captured

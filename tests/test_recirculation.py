@@ -266,8 +266,8 @@ def test_design_point_of_the_paper_comes_out_with_any_airflow_of_the_servers(
 def test_any_design_point_comes_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))])
-    open_hall = config.hall.layout.model_copy(update={"containment": 0.0})
-    hall = config.hall.model_copy(update={"layout": open_hall})
+    settings = config.hall.recirculation.model_copy(update={"approach_of": "hall"})
+    hall = config.hall.model_copy(update={"recirculation": settings})
     sums = at_design([config.model_copy(update={"hall": hall})])
     found = sums.rack_inlet_c - config.hall.design_supply_c
     scaled_to, given = hall.recirculation.scaled_to, np.array(hall.supply_approach_k)
@@ -282,12 +282,43 @@ def test_any_design_point_comes_out(seed: int) -> None:
 
 
 def test_containment_takes_its_share_of_the_paths() -> None:
-    by_rack = "hall.recirculation.calibrate=rack"
+    by_rack = "hall.recirculation={calibrate: rack, approach_of: open_hall}"
     whole = calibrate(load_config("corrected", [by_rack])).matrix()
     for containment in (0.25, 0.9, 1.0):
         config = load_config("corrected", [f"hall.layout.containment={containment}", by_rack])
         part = calibrate(config).matrix()
         np.testing.assert_allclose(part, (1 - containment) * whole, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("containment", [0.0, 0.3, 0.85, 0.999])
+@pytest.mark.parametrize("zones", [1, 5])
+@pytest.mark.parametrize("more", [[], ["hvac.crac={units: 4, spare_units: 1}"]])
+def test_measured_approaches_are_those_of_the_hall_as_it_stands(
+    containment: float, zones: int, more: list[str]
+) -> None:
+    measured_k = np.random.default_rng(zones).uniform(1.0, 6.0, 20)
+    contained = [f"hall.layout.containment={containment}", f"hall.height_zones={zones}", *more]
+    measured = [f"hall.supply_approach_k={measured_k.tolist()}", *contained]
+    scaled_to_racks = [*measured, "hall.recirculation.calibrate=rack"]
+    by_rack = at_design([load_config("corrected", scaled_to_racks)])
+    np.testing.assert_allclose(by_rack.rack_inlet_c - 23.0, measured_k, rtol=0, atol=1e-9)
+    for scaled_to, shape in (("row", (4, 5)), ("hall", (1, 20))):
+        settings = f"hall.recirculation={{calibrate: {scaled_to}, approach_of: hall}}"
+        means = at_design([load_config("corrected", [*measured, settings])])
+        np.testing.assert_allclose(
+            means.rack_inlet_c.reshape(shape).mean(axis=1) - 23.0,
+            measured_k.reshape(shape).mean(axis=1),
+            rtol=0,
+            atol=1e-9,
+        )
+
+
+def test_closed_hall_with_measured_approaches_is_refused() -> None:
+    measured = ["hall.layout.containment=1", "hall.recirculation.calibrate=rack"]
+    with pytest.raises(SdcError, match=r"containment 1 leaves no path .* valid is conta"):
+        load_config("corrected", measured)
+    load_config("corrected", [*measured, "hall.recirculation.approach_of=open_hall"])
+    assert at_design([load_config("corrected", [*measured, "hall.supply_approach_k=0"])])
 
 
 # --- conservation -------------------------------------------------------------------------------

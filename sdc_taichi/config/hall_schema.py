@@ -113,6 +113,16 @@ class RecirculationConfig(Section):
     of each ``row`` or of the ``hall``, within which racks differ by the layout or the matrix file.
     ``none`` does not scale a matrix file. None means ``none`` with a matrix file and ``row``
     without one."""
+    approach_of: Literal["open_hall", "hall"] | None = None
+    """Hall that the approach temperatures describe: the ``open_hall`` without containment, in which
+    containment then reduces them, or the ``hall`` as it stands, where they were measured. None
+    means ``hall`` with ``calibrate: rack``, and ``open_hall`` otherwise."""
+
+    @property
+    def is_of_open_hall(self) -> bool:
+        """True if the approach temperatures are those without containment."""
+        of_hall = "hall" if self.scaled_to == "rack" else "open_hall"
+        return (self.approach_of or of_hall) == "open_hall"
 
     @property
     def scaled_to(self) -> Literal["rack", "row", "hall", "none"]:
@@ -296,6 +306,11 @@ class HallConfig(Section):
         """Number of racks, rows x racks per row."""
         return self.rows * self.racks_per_row
 
+    @property
+    def remaining_paths(self) -> float:
+        """Air paths that remain, as a share of those in the hall of the approach temperatures."""
+        return 1.0 - self.layout.containment if self.recirculation.is_of_open_hall else 1.0
+
     def __hash__(self) -> int:
         """Return a hash of all fields; ``rack_types`` enters as a tuple of names and types."""
         values = {**self.__dict__, "rack_types": tuple(self.rack_types.items())}
@@ -369,6 +384,17 @@ class HallConfig(Section):
     def _one_entry_per_rack(self) -> Self:
         for name in ("servers_per_rack", "supply_approach_k", "return_approach_k"):
             check_one_per_rack(name, getattr(self, name), self.racks)
+        return self
+
+    @model_validator(mode="after")
+    def _closed_hall_has_no_approach(self) -> Self:
+        closed = self.layout.containment == 1.0 and self.inlet_model == "recirculation"
+        if closed and not self.recirculation.is_of_open_hall and np.any(self.rack_approach_k() > 0):
+            raise ValueError(
+                "layout.containment 1 leaves no path for the exhaust air that the measured "
+                "supply_approach_k needs; valid is containment below 1, supply_approach_k 0, or "
+                "recirculation.approach_of open_hall"
+            )
         return self
 
 

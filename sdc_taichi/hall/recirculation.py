@@ -83,10 +83,10 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
     """Calibrate the recirculation of a hall, from its layout or from a matrix file.
 
     The exhaust share of rack j is r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, with the
-    approach temperatures a without containment and the temperature rises dT through the racks. If
-    only means of the approach temperatures are configured, r_j = k e_j / (1 + k e_j): the ratio of
-    exhaust to supply air is the exposure e_j times a factor k, which is equal for all racks of the
-    row or hall. Containment reduces the exhaust shares.
+    approach temperatures a and the temperature rises dT through the racks. If only means of the
+    approach temperatures are configured, r_j = k e_j / (1 + k e_j): the ratio of exhaust to supply
+    air is the exposure e_j times a factor k, which is equal for all racks of the row or hall.
+    Containment reduces the exhaust shares if the approach temperatures are those of the open hall.
 
     Args:
         config: A data center with inlet model ``recirculation``.
@@ -112,14 +112,16 @@ def _calibrated(
 ) -> Recirculation:
     """Calibrate the recirculation from a design point without recirculation.
 
-    Containment c reduces both paths by the factor 1 - c: the exhaust share r of the racks and the
-    share of supply air that bypasses them. The CRAC airflow is sized for the resulting airflows.
+    If the approach temperatures are those of the open hall, containment c reduces both paths by the
+    factor 1 - c: the exhaust share r of the racks and the share of supply air that bypasses them.
+    The CRAC airflow is sized for the resulting airflows. Approach temperatures of the hall as it
+    stands include what containment does.
     """
     if config.hall.recirculation.matrix_file is None:
         weights, open_share, design = _from_layout(config, servers, design)
     else:
         weights, open_share, design = _from_matrix_file(config, servers, design)
-    open_part = 1.0 - config.hall.layout.containment
+    open_part = config.hall.remaining_paths
     share = open_share * open_part
     group_share = servers.per_group(share) * design.height_factor
     _check_intakes(config, servers, group_share)

@@ -170,7 +170,8 @@ class InletParts:
     """Share of the air paths between exhausts and inlets that containment closes, 0..1."""
     contained_k: float | None
     """Reduction of the inlet temperature by containment at the same exhaust temperatures, in K;
-    None if containment closes every path."""
+    None if containment closes every path, or if the measured exhaust share leaves the open hall no
+    supply air."""
     airflow_m3s: float
     """Airflow through the rack, in m3/s."""
     power_w: float
@@ -314,6 +315,7 @@ class Inlets:
         exhaust_k *= self._air.exhaust_c - supply_c
         open_share = share / (1.0 - closed) if closed < 1.0 else np.nan
         contained_k = (open_share - share) * height * cover * mix_k
+        is_known = open_share * height < 1.0
         return replace(
             plain,
             exhaust_k=exhaust_k,
@@ -322,7 +324,7 @@ class Inlets:
             layout_k=share * mix_k,
             height_k=share * (height - 1.0) * mix_k,
             shortfall_k=fresh * (1.0 - cover) * mix_k,
-            contained_k=contained_k if closed < 1.0 else None,
+            contained_k=contained_k if is_known else None,
         )
 
     def _group_inlets(self) -> F64:
