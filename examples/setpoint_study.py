@@ -29,7 +29,7 @@ def power_kw(
     setpoint_c: npt.ArrayLike,
     overrides: tuple[str, ...] = (),
 ) -> npt.NDArray[np.float64]:
-    """IT and HVAC power on the grid, shape (wet bulbs, utilisations, setpoints).
+    """Facility power on the grid, shape (wet bulbs, utilisations, setpoints).
 
     Args:
         preset: name of a preset or path of a config.
@@ -59,7 +59,7 @@ def power_kw(
     with Simulator(configs, drivers=drivers, precision="f64") as sim:
         sim.reset()
         result = sim.step()
-    return ((result.it_w + result.hvac_w) / 1e3).reshape(len(wet), len(load), len(setpoints))
+    return ((result.it_w + result.overhead_w) / 1e3).reshape(len(wet), len(load), len(setpoints))
 
 
 def main(folder: Path) -> None:
@@ -90,7 +90,7 @@ def main(folder: Path) -> None:
             )
             print(f"{wet_bulb[w]:6.0f}  {cells}")
     axes[0].set_ylabel("outdoor wet bulb (C)")
-    figure.colorbar(image, ax=axes, label="setpoint of least IT + HVAC power (C)")
+    figure.colorbar(image, ax=axes, label="setpoint of least facility power (C)")
     figure.savefig(folder / "best_setpoint.png", dpi=110)
 
 

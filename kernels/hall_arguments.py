@@ -78,7 +78,15 @@ DC_INTS = {
     "supply_rows": "number of supply temperatures in the table (dense halls)",
     "modes": "number of modes, and of sampled racks (sparse halls)",
     "first_sample": "first entry in sample_outlet_c (sparse halls)",
+    "first_fan_knee": "first knee of the airflow ratio of the servers",
+    "first_cpu_knee": "first knee of the power ratio of the servers, after the last of the airflow",
 }
+KNEES = {
+    "inlet_c": "inlet above which the slope is another, C",
+    "slope_per_k": "change of the slope at no load, 1/K",
+    "shift_per_k": "increase of this change from no load to full load, 1/K",
+}
+"""Knees of the curves of the servers, see ``sdc_taichi/plant/servers.py``."""
 DC_CONTROL = {
     "status": "RUNNING, DONE or NOT_CONVERGED",
     "exchanges_before": "1 if the next sweep starts with an exchange (sparse or transient)",
@@ -297,6 +305,7 @@ ARGUMENTS = {
     "run_ints": _numbers("i32", 2, RUN_INTS, "runs"),
     # Halls, and their boundary conditions.
     "dc_coefficients": _numbers("real", 1, DC_COEFFICIENTS, "dcs"),
+    "server_knees": _numbers("real", 2, KNEES, "knees"),
     "rack_inputs": _vectors(2, RACK_INPUTS, "blocks"),
     "group_inputs": _vectors(1, GROUP_INPUTS, "groups"),
     "unit_inputs": _numbers("real", 2, UNIT_INPUTS, "units"),

@@ -88,6 +88,7 @@ def broadcast_rack(
 ):
     """Copy the values of one rack, and of its intake air, to all lanes, for groups of that rack."""
     of_racks.deviation_scale = ti.Vector([racks.deviation_scale[lane]] * LANES)
+    of_racks.utilisation = ti.Vector([racks.utilisation[lane]] * LANES)
     of_racks.cpu_base = ti.Vector([racks.cpu_base[lane]] * LANES)
     of_racks.fan_base = ti.Vector([racks.fan_base[lane]] * LANES)
     of_racks.fan_low = ti.Vector([racks.fan_low[lane]] * LANES)

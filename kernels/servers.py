@@ -2,7 +2,8 @@
 
 A server has these curves of inlet T (at most the curve limit) and utilisation u (Sun et al. 2021;
 EnergyPlus ElectricEquipment:ITE:AirCooled). Power without fans is max(idle, full (slope T + offset
-+ shift u)). The airflow ratio is y = clip(slope T + offset + shift u). Fan power is
++ shift u)). The airflow ratio is y = clip(slope T + offset + shift u). Each knee of a curve at
+T_k adds (slope_k + shift_k u) max(T, T_k) to its line. Fan power is
 reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has the same curves in
 NumPy. Fans move the volume y at inlet density, but airflows are volumes at a reference
 temperature. The airflow is therefore y times the density at the inlet divided by that at the
@@ -71,6 +72,10 @@ def server_model(hall: ti.template(), n):
         fan_full_w=dc.fan_reference_w * at_full,
         full_m3s=dc.fan_full_m3s,
         curve_limit_c=hall.zeros + dc.curve_limit_c,
+        # The knees of power follow those of the airflow ratio.
+        first_fan_knee=dc.first_fan_knee,
+        first_cpu_knee=dc.first_cpu_knee,
+        end_knee=hall.dcs[n + 1].first_fan_knee,
         air_j_per_m3_k=air_j_per_m3_k,
         per_air=hall.real(1.0) / air_j_per_m3_k,
         # Heat that the air takes up per airflow and K of server minus inlet temperature.
@@ -154,6 +159,7 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
         # A group has the utilisation u + deviation*u*(1 - u): it keeps the total work of the rack
         # and stays within 0..1.
         deviation_scale=u * (hall.real(1.0) - u),
+        utilisation=u,
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
@@ -177,6 +183,20 @@ def group_inlet(hall: ti.template(), air: ti.template(), group):
     if ti.static(hall.recirculates):
         inlet_c = air.least_c - group.height_factor * air.per_height_k
     return inlet_c
+
+
+@ti.func
+@no_type_check
+def knee_terms(hall: ti.template(), first, end, on_curve_c, load):
+    """Return the sum of the terms of the knees ``first`` to ``end`` of a curve, without ``end``."""
+    terms = hall.zeros
+    at = first
+    while at < end:
+        knee = hall.knees[at]
+        slope = load * knee.shift_per_k + knee.slope_per_k
+        terms += larger(on_curve_c, hall.zeros + knee.inlet_c) * slope
+        at += hall.one
+    return terms
 
 
 @ti.func
@@ -205,8 +225,11 @@ def compute_group(
             deviation[i] = hall.group_load[at]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
     cpu_ratio = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
-    cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
     airflow = on_curve_c * servers.fan_slope + (deviation * servers.fan_shift + racks.fan_base)
+    load, cpu_knee = deviation + racks.utilisation, servers.first_cpu_knee
+    airflow += knee_terms(hall, servers.first_fan_knee, cpu_knee, on_curve_c, load)
+    cpu_ratio += knee_terms(hall, cpu_knee, servers.end_knee, on_curve_c, load)
+    cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
     airflow = smaller(larger(airflow, racks.fan_low), servers.fan_high)
     fan_power = airflow
     if servers.fan_exponent == hall.real(3.0):

@@ -34,9 +34,19 @@ def line(x0: float, x1: float, y0: float, y1: float, x: F64) -> F64:
     return np.asarray(y0 + (y1 - y0) / (x1 - x0) * (x - x0))
 
 
+def through(points: Sequence[tuple[float, float, float]], inlet_c: F64, load: F64) -> F64:
+    """The curve through (inlet, ratio at no load, ratio at full load), at inlet_c and load."""
+    at_c, idle, full = np.array(points).T
+    no_load = np.interp(inlet_c, at_c, idle)
+    return np.asarray(no_load + load * (np.interp(inlet_c, at_c, full) - no_load))
+
+
 def cpu_w(config: DataCenterConfig, full_w: F64, idle_w: F64, inlet_c: F64, load: F64) -> F64:
     """CPU power of one server, W (Sun et al. 2021: linear in inlet, shifted by load)."""
     s = config.servers
+    if s.cpu_power_points is not None:
+        ratio = through(s.cpu_power_points, inlet_c, load) + s.cpu_slope_offset_per_k * inlet_c
+        return np.maximum(idle_w, full_w * ratio)
     ratio = line(
         *s.inlet_range_c, s.cpu_power_ratio_lb[0], s.cpu_power_ratio_ub[0], inlet_c
     ) + load * (s.cpu_power_ratio_lb[1] - s.cpu_power_ratio_lb[0])
@@ -48,7 +58,9 @@ def airflow_ratio(config: DataCenterConfig, inlet_c: F64, load: F64) -> F64:
     """Server airflow over full airflow."""
     s = config.servers
     (low, high), shift = s.inlet_range_c, s.fan_airflow_ratio_lb[1] - s.fan_airflow_ratio_lb[0]
-    if s.fan_model == "linear":
+    if s.fan_airflow_points is not None:
+        ratio = through(s.fan_airflow_points, inlet_c, load)
+    elif s.fan_model == "linear":
         ratio = line(low, high, s.fan_airflow_ratio_lb[0], s.fan_airflow_ratio_ub[0], inlet_c)
         ratio = ratio + shift * load
     else:

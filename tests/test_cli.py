@@ -90,10 +90,10 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
         expected = {
             "it_kwh": it,
             "hvac_kwh": total["hvac_kwh"],
-            "facility_kwh": it + total["hvac_kwh"],
+            "facility_kwh": it + total["overhead_w"] * h / 1e3,
             "battery_net_kwh": total["charge_kwh"] - total["discharge_kwh"],
             "grid_kwh": total["grid_kwh"],
-            "pue": (it + total["hvac_kwh"]) / it,
+            "pue": 1 + total["overhead_w"] * h / 1e3 / it,
             "ups_loss_kwh": total["ups_loss_w"] * h / 1e3,
             "distribution_loss_kwh": total["distribution_loss_w"] * h / 1e3,
             "pue_with_losses": 1

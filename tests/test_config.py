@@ -244,7 +244,8 @@ def test_values_that_are_not_valid_are_named(assigned: Any, message: str) -> Non
     ids=["curve", "offset", "one rack", "setpoint"],
 )  # fmt: skip
 def test_servers_without_airflow_are_refused(changes: list[str]) -> None:
-    unlimited = ["servers.fan_airflow_ratio_limits=null", "hall.supply_approach_limits_k=null",
+    unlimited = ["servers.fan_airflow_ratio_limits=null", "servers.fan_model=linear",
+                 "hall.supply_approach_limits_k=null",
                  "hvac.chiller.coil_approach_k=5", "servers.groups=null",
                  "hall.supply_approach_k=1", "servers.power_w=[150, 10]"]  # fmt: skip
     load_config("tiny", unlimited)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sdc_taichi import Actions, Simulator, StepResult, load_config
+from sdc_taichi import Actions, Simulator, StepResult, load_config, preset_names
 from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError
@@ -185,7 +185,8 @@ def test_efficiencies_are_the_published_ones(
 
 
 def test_reported_losses_change_nothing_else_and_counted_ones_are_paid_for() -> None:
-    told, paid = charged([], command=0.0), charged(["electrical.losses=counted"], command=0.0)
+    reported = ["electrical.losses=reported"]
+    told, paid = charged(reported, command=0.0), charged([], command=0.0)
     for name in ("it_w", "hvac_w", "ups_loss_w", "distribution_loss_w"):
         np.testing.assert_array_equal(column(told, name), column(paid, name))
     lost_kwh = (column(told, "ups_loss_w") + column(told, "distribution_loss_w")) / 4e3
@@ -199,12 +200,18 @@ def test_reported_losses_change_nothing_else_and_counted_ones_are_paid_for() -> 
     carbon = column(paid, "carbon_g") / column(told, "carbon_g")
     cost = column(paid, "energy_cost") / column(told, "energy_cost")
     np.testing.assert_allclose(carbon, cost, rtol=1e-12)
-    assert design_kw(["electrical.losses=counted"]) > 1.03 * design_kw([])
+    assert design_kw([]) > 1.03 * design_kw(reported)
+
+
+def test_losses_count_but_in_the_presets_of_paper_and_released_code() -> None:
+    for preset in preset_names():
+        losses = load_config(preset).electrical.losses
+        assert (losses == "reported") == (preset in ("paper", "sustaindc")), preset
 
 
 def test_nothing_is_lost_without_power() -> None:
     outage = "events.scheduled=[{kind: grid_outage, start_h: 0.25, duration_h: 0.5}]"
-    found = charged([outage, "electrical.losses=counted", "battery.capacity_kwh=0"], 0.0, 4)
+    found = charged([outage, "battery.capacity_kwh=0"], 0.0, 4)
     for name in ("ups_loss_w", "distribution_loss_w", "overhead_w", "grid_kwh"):
         lost = column(found, name)
         assert lost[0] > 0 == lost[1] == lost[2] < lost[3], name

@@ -150,7 +150,7 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
     lowest, highest = min(ci, *ci_ahead), max(ci, *ci_ahead)
     last = view.last
     kwh_per_w = 1.0 / per_hour / 1000.0
-    hvac_w = float(sizing.facility_w[dc] - sizing.it_w[dc])
+    hvac_w = float(sizing.facility_w[dc] - sizing.it_w[dc] - sizing.counted_loss_w[dc])
     battery_kwh = float(sizing.battery_kwh[dc])
     units = view.state.setpoint_c[view.fleet.unit_offsets[dc] : view.fleet.unit_offsets[dc + 1]]
     return {
@@ -184,7 +184,9 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
         ],
         "hvac_energy": [0.0 if last is None else float(last.hvac_kwh[dc] / (hvac_w * kwh_per_w))],
         "dc_load": [
-            0.0 if last is None else float((last.it_w + last.hvac_w)[dc] / sizing.facility_w[dc])
+            0.0
+            if last is None
+            else float((last.it_w + last.overhead_w)[dc] / sizing.facility_w[dc])
         ],
         "soc": [float(view.state.stored_kwh[dc]) / battery_kwh if battery_kwh else 0.0],
     }

@@ -49,7 +49,7 @@ def test_terms_are_what_their_names_say() -> None:
     expected = {
         "carbon": -result.carbon_g / (CI_G_PER_KWH * design_kwh),
         "total_energy": -result.grid_kwh / design_kwh,
-        "facility_energy": -(result.it_kwh + result.hvac_kwh) / design_kwh,
+        "facility_energy": -(result.it_kwh + result.overhead_w / 4e3) / design_kwh,
         "it_energy": -result.it_kwh / design_kwh,
         "hvac_energy": -result.hvac_kwh / design_kwh,
         "fossil_share": -result.grid_kwh * (result.ci_g_per_kwh / FOSSIL_G_PER_KWH) / design_kwh,

@@ -72,19 +72,20 @@ def test_offsets_of_a_ragged_fleet() -> None:
 
 
 def test_parameters_of_each_data_center_reach_the_kernel() -> None:
+    straight = ["servers.cpu_power_points=null", "servers.fan_airflow_points=null"]
     configs = [
-        TINY,
+        named(TINY, "a", *straight),
         named(TINY, "b", "servers.fan_power_exponent=2.5", "servers.fan_reference_w=7",
               "servers.fan_full_airflow_m3s=0.04", "servers.fan_airflow_ratio_limits=null",
               "hall.air_density_kg_m3=1.1"),
     ]  # fmt: skip
     row = dict(zip(DC_COEFFICIENTS, build_fleet(configs).dcs, strict=True))
-    np.testing.assert_allclose(row["cpu_slope_per_k"], 1 / 600)
-    np.testing.assert_allclose(row["cpu_offset"], -1 / 60)
-    np.testing.assert_allclose(row["cpu_shift"], 0.99)
-    np.testing.assert_allclose(row["fan_slope_per_k"], 0.215 / 12)
-    np.testing.assert_allclose(row["fan_offset"], 0.225 - 28 * 0.215 / 12)
-    np.testing.assert_allclose(row["fan_shift"], 0.215)
+    np.testing.assert_allclose(row["cpu_slope_per_k"], [1 / 600, 0.0])
+    np.testing.assert_allclose(row["cpu_offset"], [-1 / 60, 0.01])
+    np.testing.assert_allclose(row["cpu_shift"], [0.99, 0.99 - 15 * 0.04 / 30])
+    np.testing.assert_allclose(row["fan_slope_per_k"], [0.215 / 12, 0.0])
+    np.testing.assert_allclose(row["fan_offset"], [0.225 - 28 * 0.215 / 12, -0.38])
+    np.testing.assert_allclose(row["fan_shift"], [0.215, 0.24])
     assert row["fan_low"].tolist() == [0.2, 0.0]
     assert row["fan_high"].tolist() == [0.62, np.inf]
     assert row["fan_exponent"].tolist() == [3.0, 2.5]

@@ -176,6 +176,7 @@ def test_load_weights_conserve_the_work_of_a_rack(seed: int, load: float) -> Non
     rng = np.random.default_rng(seed)
     values = preset_values("tiny")
     values["servers"] |= {
+        "cpu_power_points": None,
         "cpu_power_ratio_lb": [0.0, 1.0],
         "cpu_power_ratio_ub": [0.0, 1.0],
         "fan_reference_w": 0.0,

@@ -38,10 +38,11 @@ def test_best_setpoint_of_corrected_moves_with_weather_and_load(study: ModuleTyp
     interior = (best > 16.0) & (best < 23.0)
     assert len(np.unique(best)) >= 4
     assert len(np.unique(best[interior])) >= 3
-    # In summer a chiller saves 3 % of its power per kelvin, about what fans and servers cost.
     assert interior.mean() > 0.2
     assert any(len(np.unique(column)) > 2 for column in best.T), "moves with weather"
     assert any(len(np.unique(row)) > 2 for row in best), "moves with load"
+    # Fans turn faster above 25 C alone, so the coldest air is not the best in summer.
+    assert np.all(best[wet_bulb >= 15.0] > 17.0)
 
 
 @pytest.mark.repo
@@ -61,12 +62,12 @@ def test_annual_pue_of_all_sites_is_that_of_real_plants() -> None:
     assert len(sites) >= 8
     with Simulator(make_configs(base, sites=sites)) as sim:
         sim.reset()
-        it_kwh, hvac_kwh = np.zeros(sim.size), np.zeros(sim.size)
+        it_kwh, facility_kwh = np.zeros(sim.size), np.zeros(sim.size)
         for _ in range(8760):
             result = sim.step()
             it_kwh += result.it_kwh
-            hvac_kwh += result.hvac_kwh
-    pue = 1.0 + hvac_kwh / it_kwh
+            facility_kwh += result.facility_kwh
+    pue = facility_kwh / it_kwh
     assert np.all((pue > 1.05) & (pue < 1.7)), dict(zip(sites, pue.round(3), strict=True))
     hot, cold = sites.index("AZ"), sites.index("WA")
     assert pue[hot] > pue[cold]
@@ -138,7 +139,7 @@ def test_server_fans_draw_what_is_published() -> None:
         steps = [sim.step() for _ in range(24 * 28)]
     share = sum(float(r.it_fan_w[0]) for r in steps) / sum(float(r.it_w[0]) for r in steps)
     assert 0.02 < share < 0.06
-    # A rack of 39 servers at 70 % load: 5.2 % more power at 27 C than at 20 C, 17 % at 31 C.
+    # A server at 31, 33 and 35 C draws 2.8, 4.6 and 7.8 % more than at 27 C (McManis 2016).
     curves, load = config.servers.curves, np.array(0.7)
     reference = config.servers.fan_reference_share
     assert reference is not None
@@ -148,8 +149,9 @@ def test_server_fans_draw_what_is_published() -> None:
         fan_w = curves.fan_w(curves.airflow_ratio(inlet, load), reference)
         return float(curves.cpu_w(inlet, load, np.ones(1), np.zeros(1))[0] + fan_w)
 
-    assert server_w(27.0) / server_w(20.0) == pytest.approx(1.052, abs=0.005)
-    assert 1.08 < server_w(31.0) / server_w(20.0) < 1.17
+    assert server_w(27.0) / server_w(20.0) < 1.03
+    for inlet_c, measured in ((31.0, 1.028), (33.0, 1.046), (35.0, 1.078)):
+        assert server_w(inlet_c) / server_w(27.0) == pytest.approx(measured, abs=0.015)
     # Fans at full speed draw 12 to 21 % of what servers draw without them.
     most = curves.fan_w(np.array(curves.fan_high), reference)
     assert 0.12 < float(most) < 0.21

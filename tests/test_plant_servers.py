@@ -22,7 +22,7 @@ def test_density_of_air() -> None:
 
 
 def test_curve_coefficients_by_hand() -> None:
-    curves = load_config("corrected").servers.curves
+    curves = load_config("paper").servers.curves
     cpu = curves.cpu_slope_per_k, curves.cpu_offset, curves.cpu_shift
     fan = curves.fan_slope_per_k, curves.fan_offset, curves.fan_shift
     assert cpu == pytest.approx((1 / 600, -1 / 60, 0.99))
@@ -41,7 +41,8 @@ def test_line_goes_through_the_given_points() -> None:
 
 
 def test_fans_never_blow_backwards_and_curves_end_at_the_limit() -> None:
-    curves = load_config("corrected", ["servers.fan_airflow_ratio_limits=null"]).servers.curves
+    changes = ["servers.fan_model=linear", "servers.fan_airflow_ratio_limits=null"]
+    curves = load_config("corrected", changes).servers.curves
     idle = np.zeros(1)
     assert curves.airflow_ratio(np.array([-40.0]), idle) == 0.0
     at_limit, beyond = np.array([45.0]), np.array([60.0])
@@ -58,8 +59,12 @@ def test_fans_never_blow_backwards_and_curves_end_at_the_limit() -> None:
         ["servers.fan_model=released", "servers.fan_power_exponent=1"],
         ["servers.fan_power_exponent=2.2", "servers.fan_reference_ratio=0.6"],
         ["servers.curve_limit_c=23", "servers.fan_airflow_ratio_limits=[0.1, 0.4]"],
+        [
+            "servers.fan_airflow_points=[[18, 0.3, 0.4], [24, 0.35, 0.5], [26, 0.3, 0.6]]",
+            "servers.cpu_power_points=[[20, 0.1, 0.9], [25.1, 0.2, 0.95], [25.4, 0.2, 1]]",
+        ],
     ],
-    ids=["cubic", "released", "other exponent", "limits"],
+    ids=["cubic", "released", "other exponent", "limits", "points"],
 )
 def test_kernel_computes_the_same_curves(changes: list[str]) -> None:
     config = load_config("tiny", ["hvac.setpoint.initial_c=20", *changes])
@@ -76,3 +81,59 @@ def test_kernel_computes_the_same_curves(changes: list[str]) -> None:
     np.testing.assert_allclose(result.rack_airflow_m3s[racks], 3 * 0.03 * moved, rtol=1e-12)
     np.testing.assert_allclose(result.rack_cpu_w[racks], 3 * cpu_w, rtol=1e-12)
     np.testing.assert_allclose(result.rack_fan_w[racks], 3 * curves.fan_w(ratio, 10.0), rtol=1e-12)
+
+
+POINTS = [(18.0, 0.3, 0.4), (24.0, 0.35, 0.5), (26.0, 0.3, 0.6), (50.0, 1.0, 0.7)]
+
+
+def test_curve_goes_through_all_points_and_is_constant_beyond() -> None:
+    changes = [f"servers.fan_airflow_points={[*map(list, POINTS)]}", "servers.curve_limit_c=40"]
+    changes += ["servers.fan_airflow_ratio_limits=null"]
+    curves = load_config("corrected", changes).servers.curves
+    inlet_c = np.array([0.0, 18.0, 21.0, 24.0, 25.2, 26.0, 33.0, 40.0, 55.0])
+    for load in (0.0, 0.3, 1.0):
+        at_c, idle, full = np.array(POINTS).T
+        ratio = (1.0 - load) * idle + load * full
+        expected = np.interp(np.minimum(inlet_c, 40.0), at_c, ratio)
+        at_load = np.full(inlet_c.shape, load)
+        np.testing.assert_allclose(curves.airflow_ratio(inlet_c, at_load), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("preset", ["corrected", "large", "tiny", "hall_of_2026"])
+@pytest.mark.parametrize("load", [0.3, 0.6, 1.0])
+def test_power_over_inlet_has_a_knee(preset: str, load: float) -> None:
+    """ASHRAE TC 9.9 (2011): power at 30 C is 4..8 % and at 35 C 7..20 % above that at 15 C.
+
+    Fans turn faster from 23 to 25 C on, and at 27 C power is at most 3 % above that at 15 C.
+    """
+    servers = load_config(preset).servers
+    curves, utilisation = servers.curves, np.array(load)
+    share = servers.fan_reference_share or 10.0 / 150.0
+
+    def power(inlet_c: float) -> float:
+        inlet = np.array(inlet_c)
+        ratio = curves.airflow_ratio(inlet, utilisation)
+        watts = curves.cpu_w(inlet, utilisation, np.array(1.0), np.array(0.05))
+        return float(watts + curves.fan_w(ratio, share))
+
+    for cool_c in (15.0, 18.0, 20.0):
+        assert 1.0 < power(27.0) / power(cool_c) < 1.03
+    assert 1.04 < power(30.0) / power(15.0) < 1.08
+    assert 1.07 < power(35.0) / power(15.0) < 1.20
+    airflow = curves.airflow_ratio(np.array([10.0, 20.0, 25.0, 27.0]), utilisation)
+    assert airflow[0] == pytest.approx(airflow[1]) == pytest.approx(airflow[2])
+    assert airflow[3] > airflow[2]
+
+
+def test_a_straight_line_replaces_the_points_of_a_preset() -> None:
+    for line in (
+        "fan_airflow_ratio_lb=[0.1, 0.3]",
+        "fan_airflow_ratio_ub=[0.3, 0.5]",
+        "inlet_range_c=[15, 30]",
+        "fan_model=linear",
+    ):
+        assert load_config("corrected", [f"servers.{line}"]).servers.fan_airflow_points is None
+    for line in ("cpu_power_ratio_lb=[0.1, 0.9]", "cpu_power_ratio_ub=[0.1, 1.1]"):
+        servers = load_config("corrected", [f"servers.{line}"]).servers
+        assert servers.cpu_power_points is None
+        assert servers.fan_airflow_points is not None

@@ -177,9 +177,8 @@ def test_every_server_may_be_its_own(precision: Precision) -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_fans_without_limits_of_their_airflow(precision: Precision) -> None:
     # Twenty racks leave places of blocks empty.
-    config = load_config(
-        "corrected", ["servers.fan_power_exponent=2.5", "servers.fan_airflow_ratio_limits=null"]
-    )
+    changes = ["fan_model=linear", "fan_power_exponent=2.5", "fan_airflow_ratio_limits=null"]
+    config = load_config("corrected", [f"servers.{change}" for change in changes])
     assert_agrees([config], Conditions(np.array([18.0]), np.array([0.05])), precision)
     # The curve is below 0 here, and fans do not blow backwards.
     hall = Hall(fleet_of(config), precision)

@@ -47,9 +47,9 @@ class DistributionConfig(Section):
 class ElectricalConfig(Section):
     """Grid connection, UPS and distribution of a data center."""
 
-    losses: Literal["reported", "counted"] = "reported"
+    losses: Literal["counted", "reported"] = "counted"
     """Treatment of the losses of UPS and distribution: ``counted`` in grid energy, PUE, carbon and
-    cost, or only ``reported`` separately."""
+    cost, as ISO/IEC 30134-2 defines PUE, or only ``reported`` separately."""
     capacity_ratio: Annotated[float, Field(ge=1, le=10)] = 1.25
     """Rated power of UPS and distribution divided by their load at the design point, 1..10: 1.25 if
     four of five modules suffice (N+1), 2 if one of two paths suffices (2N)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -28,7 +29,7 @@ from sdc_taichi.config.fields import (
     check_one_per_rack,
 )
 from sdc_taichi.errors import shortened, suggestion_or_valid
-from sdc_taichi.plant.servers import ServerCurves, linear_curve
+from sdc_taichi.plant.servers import Knee, ServerCurves, curve_through, linear_curve
 
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
@@ -45,6 +46,8 @@ LEAST_INLET_RANGE_K = 5.0
 """Smallest difference of the two inlet temperatures that define the server curves, in K. Real fans
 reach full speed over about 10 K. With a difference of 1 K, the curves extrapolated by a few kelvins
 would give a hundred times the fan power."""
+LEAST_POINTS_APART_K = 0.1
+"""Smallest difference of inlet temperature of two points of a server curve, in K."""
 RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
 """Number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
@@ -53,6 +56,12 @@ FullAirflow = Annotated[float, Field(ge=1e-4, le=100)]
 """Airflow of a server at full speed, in m3/s, 1e-4..100."""
 DesignRiseK = Annotated[float, Field(ge=2, le=40)]
 """Temperature rise of the air through a server at the design point, in K, 2..40."""
+PowerPoint = tuple[AirC, PowerRatio, PowerRatio]
+"""Inlet temperature, in C, and power divided by full power at no load and at full load."""
+AirflowRatio = Annotated[float, Field(ge=0, le=10)]
+"""Airflow of a server divided by its full airflow, 0..10."""
+AirflowPoint = tuple[AirC, AirflowRatio, AirflowRatio]
+"""Inlet temperature, in C, and airflow ratio at no load and at full load."""
 RackLength = Annotated[float, Field(ge=0.1, le=5)]
 """Dimension of a rack, in m, 0.1..5; usual racks are about 0.6 m wide, 1.2 m deep and 2.1 m
 high."""
@@ -413,6 +422,10 @@ class ServerConfig(Section):
     cpu_power_ratio_ub: tuple[PowerRatio, PowerRatio] = (0.03, 1.02)
     """CPU power divided by full power at the warmest inlet of ``inlet_range_c``: at no load, and at
     full load."""
+    cpu_power_points: tuple[PowerPoint, ...] | None = None
+    """Points (inlet temperature in C, CPU power divided by full power at no load, at full load) by
+    rising temperature. The curve is linear between them and constant beyond. It replaces
+    ``cpu_power_ratio_lb`` and ``cpu_power_ratio_ub``; None means the straight line of these."""
     cpu_slope_offset_per_k: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Addition to the slope of CPU power divided by full power against the inlet temperature, in
     1/K, -1..1: no real server is as sensitive as the bounds."""
@@ -429,9 +442,13 @@ class ServerConfig(Section):
     fan_airflow_ratio_ub: tuple[FlowRatio, FlowRatio] = (0.225, 1.0)
     """Server airflow divided by full airflow at the warmest inlet of ``inlet_range_c``: at no load,
     and at full load."""
+    fan_airflow_points: tuple[AirflowPoint, ...] | None = None
+    """Points (inlet temperature in C, airflow ratio at no load, at full load) by rising
+    temperature. The curve is linear between them and constant beyond. It replaces
+    ``fan_airflow_ratio_lb`` and ``fan_airflow_ratio_ub``; None means the straight line of these."""
     fan_model: Literal["linear", "released"] = "linear"
-    """Airflow ratio as a function of inlet temperature and load: linear between the ratios above,
-    or scaled as in the released SustainDC."""
+    """Airflow ratio as a function of inlet temperature and load: linear between the points or
+    ratios above, or the line of the ratios scaled as in the released SustainDC."""
     fan_airflow_ratio_limits: Annotated[tuple[FlowRatio, FlowRatio], Ordered] | None = None
     """Lowest and highest airflow ratio. None sets only the lower limit 0, because fans never blow
     backwards."""
@@ -480,6 +497,15 @@ class ServerConfig(Section):
         )
         if self.fan_model == "released":
             fan_slope, fan_offset, fan_shift = 10 * fan_slope, 5 * fan_offset, 5 * fan_shift
+        curve_limit_c = np.inf if self.curve_limit_c is None else self.curve_limit_c
+        cpu_knees: tuple[Knee, ...] = ()
+        fan_knees: tuple[Knee, ...] = ()
+        if self.cpu_power_points is not None:
+            line = curve_through(self.cpu_power_points, curve_limit_c)
+            cpu_slope, (cpu_offset, cpu_shift, cpu_knees) = 0.0, line
+        if self.fan_airflow_points is not None:
+            line = curve_through(self.fan_airflow_points, curve_limit_c)
+            fan_slope, (fan_offset, fan_shift, fan_knees) = 0.0, line
         fan_low, fan_high = self.fan_airflow_ratio_limits or (0.0, np.inf)
         return ServerCurves(
             cpu_slope_per_k=cpu_slope + self.cpu_slope_offset_per_k,
@@ -493,7 +519,9 @@ class ServerConfig(Section):
             fan_high=fan_high,
             fan_reference_ratio=self.fan_reference_ratio,
             fan_exponent=self.fan_power_exponent,
-            curve_limit_c=np.inf if self.curve_limit_c is None else self.curve_limit_c,
+            curve_limit_c=curve_limit_c,
+            cpu_knees=cpu_knees,
+            fan_knees=fan_knees,
         )
 
     @field_validator("power_w", mode="before")
@@ -506,6 +534,19 @@ class ServerConfig(Section):
         )
         return [value] if flat else value
 
+    @field_validator("cpu_power_points", "fan_airflow_points")
+    @classmethod
+    def _by_rising_temperature(cls, value: tuple[PowerPoint, ...] | None) -> Any:
+        if value == ():
+            raise ValueError("no point; valid is null, or one point or more")
+        for (low_c, *_), (high_c, *_) in pairwise(value or ()):
+            if high_c - low_c < LEAST_POINTS_APART_K:
+                raise ValueError(
+                    f"a point at {high_c:g} C follows one at {low_c:g} C; valid are inlet "
+                    f"temperatures that rise by at least {LEAST_POINTS_APART_K:g} K"
+                )
+        return value
+
     @field_validator("inlet_range_c")
     @classmethod
     def _wide_enough(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -514,6 +555,15 @@ class ServerConfig(Section):
                 f"({value[0]:g}, {value[1]:g}) must be at least {LEAST_INLET_RANGE_K:g} K apart"
             )
         return value
+
+    @model_validator(mode="after")
+    def _one_airflow_curve(self) -> Self:
+        if self.fan_model == "released" and self.fan_airflow_points is not None:
+            raise ValueError(
+                "fan_model released and fan_airflow_points are both given; valid is null for "
+                "fan_airflow_points, because the model scales a straight line"
+            )
+        return self
 
     @model_validator(mode="after")
     def _idle_below_full(self) -> Self:

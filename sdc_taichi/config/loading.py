@@ -27,6 +27,15 @@ _REPLACES: dict[str, dict[str, Any]] = {
     "servers.power_w": {"servers.groups": None, "hall.rack_types": {}, "hall.rack_plan": []},
     "servers.groups": {"servers.power_w": None, "hall.rack_types": {}, "hall.rack_plan": []},
     "hall.rack_types": {"servers.power_w": None, "servers.groups": None},
+    "servers.cpu_power_ratio_lb": {"servers.cpu_power_points": None},
+    "servers.cpu_power_ratio_ub": {"servers.cpu_power_points": None},
+    "servers.fan_airflow_ratio_lb": {"servers.fan_airflow_points": None},
+    "servers.fan_airflow_ratio_ub": {"servers.fan_airflow_points": None},
+    "servers.inlet_range_c": {
+        "servers.cpu_power_points": None,
+        "servers.fan_airflow_points": None,
+    },
+    "servers.fan_model": {"servers.fan_airflow_points": None},
     "servers.fan_reference_w": {"servers.fan_reference_share": None},
     "servers.fan_reference_share": {"servers.fan_reference_w": None},
 }

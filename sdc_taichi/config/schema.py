@@ -325,7 +325,8 @@ class DataCenterConfig(Section):
             raise ValueError(
                 f"servers: the airflow ratio is {ratio[worst]:.3g} at {coldest_c[worst]:g} C, the "
                 f"coldest inlet of rack {worst}, and no load; it must be positive (raise "
-                "fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
+                "the curve of fan_airflow_points or fan_airflow_ratio_lb, or set "
+                "fan_airflow_ratio_limits)"
             )
 
     @property

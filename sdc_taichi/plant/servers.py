@@ -1,20 +1,38 @@
 """Power and airflow of servers as functions of inlet temperature and load.
 
 CPU power and airflow ratio (volume flow at the inlet divided by that at full fan speed) are linear
-in inlet temperature and load. Fan power is a power function of the airflow ratio (Sun et al. 2021,
-*Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
-Reference, ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` has a compiled version of these
-curves.
+in the load, and linear or piecewise linear in the inlet temperature. Fan power is a power function
+of the airflow ratio (Sun et al. 2021, *Prototype energy models for data centers*, Energy and
+Buildings 231; EnergyPlus Engineering Reference, ElectricEquipment:ITE:AirCooled).
+``kernels/servers.py`` has a compiled version of these curves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from sdc_taichi.plant.air import DensityRatio
 from sdc_taichi.types import F64
+
+
+class Knee(NamedTuple):
+    """Inlet temperature at which the slope of a curve changes.
+
+    With the utilisation u, the curve contains the term (slope + shift*u) * max(x, inlet_c) of the
+    inlet temperature x.
+    """
+
+    inlet_c: float
+    """Inlet temperature, in C."""
+    slope_per_k: float
+    """Change of the slope at no load, in 1/K."""
+    shift_per_k: float
+    """Increase of this change from no load to full load, in 1/K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +42,8 @@ class ServerCurves:
     With x = min(inlet_c, curve_limit_c) and the utilisation u of the server, CPU power is
     max(idle, full*(cpu_slope*x + cpu_offset + cpu_shift*u)), the airflow ratio is
     y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power divided by
-    its reference value is (y/fan_reference_ratio)^fan_exponent.
+    its reference value is (y/fan_reference_ratio)^fan_exponent. The terms of the knees are added to
+    both lines.
     """
 
     cpu_slope_per_k: float
@@ -49,6 +68,10 @@ class ServerCurves:
     """Exponent of the airflow ratio in the fan power, 1..3."""
     curve_limit_c: float
     """Inlet temperature above which power and airflow no longer rise, in C; inf means no limit."""
+    cpu_knees: tuple[Knee, ...] = ()
+    """Knees of CPU power divided by full power."""
+    fan_knees: tuple[Knee, ...] = ()
+    """Knees of the airflow ratio."""
 
     def airflow_ratio(self, inlet_c: F64, utilisation: F64) -> F64:
         """Return the airflow of servers divided by their airflow at full fan speed, dimensionless.
@@ -59,6 +82,7 @@ class ServerCurves:
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         ratio = self.fan_slope_per_k * on_curve_c + self.fan_offset + self.fan_shift * utilisation
+        ratio = _add_knees(ratio, self.fan_knees, on_curve_c, utilisation)
         return np.asarray(np.clip(ratio, self.fan_low, self.fan_high))
 
     def moved_ratio(self, airflow_ratio: F64, inlet_c: F64, density_ratio: DensityRatio) -> F64:
@@ -85,6 +109,7 @@ class ServerCurves:
         """
         on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
         ratio = self.cpu_slope_per_k * on_curve_c + self.cpu_offset + self.cpu_shift * utilisation
+        ratio = _add_knees(ratio, self.cpu_knees, on_curve_c, utilisation)
         return np.asarray(np.maximum(idle_w, full_w * ratio))
 
     def fan_w(self, airflow_ratio: F64, reference_w: F64 | float) -> F64:
@@ -115,3 +140,38 @@ def linear_curve(
     slope = (ratio_at_warmest[0] - ratio_at_coolest[0]) / (warmest_c - coolest_c)
     offset = ratio_at_warmest[0] - slope * warmest_c
     return slope, offset, ratio_at_coolest[1] - ratio_at_coolest[0]
+
+
+def curve_through(
+    points: Sequence[tuple[float, float, float]], curve_limit_c: float
+) -> tuple[float, float, tuple[Knee, ...]]:
+    """Return offset, load shift and knees of the curve through points, whose slope is otherwise 0.
+
+    The curve is linear between the points and constant beyond them.
+
+    Args:
+        points: Inlet temperature, C, and ratios at no load and at full load, by rising temperature.
+        curve_limit_c: Inlet temperature above which the curve is constant, C; knees there have no
+            effect and are left out.
+    """
+    slopes = [(0.0, 0.0)]
+    for (low_c, *low), (high_c, *high) in pairwise(points):
+        idle, full = ((b - a) / (high_c - low_c) for a, b in zip(low, high, strict=True))
+        slopes.append((idle, full - idle))
+    slopes.append((0.0, 0.0))
+    knees = tuple(
+        Knee(inlet_c, after[0] - before[0], after[1] - before[1])
+        for (inlet_c, *_), (before, after) in zip(points, pairwise(slopes), strict=True)
+        if inlet_c < curve_limit_c and before != after
+    )
+    _, idle, full = points[0]
+    offset = idle - sum(knee.inlet_c * knee.slope_per_k for knee in knees)
+    return offset, full - idle - sum(knee.inlet_c * knee.shift_per_k for knee in knees), knees
+
+
+def _add_knees(ratio: F64, knees: tuple[Knee, ...], on_curve_c: F64, utilisation: F64) -> F64:
+    """Add the terms of knees to the ratio of a straight line."""
+    for knee in knees:
+        slope = knee.slope_per_k + knee.shift_per_k * utilisation
+        ratio = ratio + slope * np.maximum(on_curve_c, knee.inlet_c)
+    return ratio

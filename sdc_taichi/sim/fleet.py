@@ -403,7 +403,9 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     groups = _group_inputs(servers, full_airflow) | {
         "heat_capacity": server_j_per_k / least_j_per_k
     }
-    coefficients = asdict(curves) | {
+    of_lines = asdict(curves)
+    del of_lines["cpu_knees"], of_lines["fan_knees"]
+    coefficients = of_lines | {
         "fan_full_m3s": float(design.full_airflow_m3s.max()),
         "fan_reference_w": float(servers.fan_reference_w.max()),
         "air_j_per_m3_k": air_j_per_m3_k,

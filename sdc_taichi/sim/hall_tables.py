@@ -29,6 +29,7 @@ from sdc_taichi.kernels.hall_arguments import (
     DENSE_LANES,
     GROUP_INPUTS,
     GROUP_OUT,
+    KNEES,
     LANES,
     MIX_PATTERNS,
     MODE_VECTORS,
@@ -142,6 +143,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     most_groups, group_places = block_ints[1].max(), block_ints[1].sum()
     unit_shares, mix_weights, first_mix_weight = _build_air(fleet, places, dtype)
     steady_states, guess_rows = build_steady_states(fleet, places, dtype, {})
+    server_knees, first_knees = _build_knees(fleet, dtype)
     dc_ints = {
         "first_chunk": first_chunk,
         "first_unit": fleet.unit_offsets,
@@ -149,6 +151,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "racks": np.diff(fleet.rack_offsets),
         "first_mix_weight": first_mix_weight,
         "first_sample": [],
+        **first_knees,
     }
     rack_state = vectors(dtype, len(RACK_STATE), places.count // LANES)
     mode_amounts = vectors(dtype, slices * MODE_VECTORS)
@@ -160,6 +163,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "place_ints": place_ints,
         **_build_runs(fleet, places, dtype),
         "dc_coefficients": np.array(fleet.dcs.T, dtype, order="C").reshape(-1),
+        "server_knees": server_knees,
         "rack_inputs": _build_rack_inputs(fleet, places, dtype),
         "group_inputs": group_inputs,
         "unit_inputs": np.ones((len(UNIT_INPUTS), fleet.units), dtype),
@@ -326,6 +330,21 @@ def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -
     entry[:, :, n_racks:] = entry[:, :, n_racks - 1 : n_racks]
     servers[:, n_racks:] = 0.0
     return entry
+
+
+def _build_knees(fleet: Fleet, dtype: npt.DTypeLike) -> tuple[Array, dict[str, Array]]:
+    """Return the rows ``KNEES`` of the curves of all servers, and their index rows of ``DC_INTS``.
+
+    Data centers without knees share an array that is not empty, because kernels need an address.
+    """
+    knees_of = {id(c.servers): c.servers.curves for c in fleet.configs}
+    curves = [knees_of[id(c.servers)] for c in fleet.configs]
+    knees = [knee for c in curves for knee in (*c.fan_knees, *c.cpu_knees)]
+    first = offsets_from_counts([len(c.fan_knees) + len(c.cpu_knees) for c in curves], "knees")
+    rows = np.zeros((len(KNEES), max(1, len(knees))), dtype)
+    rows[:, : len(knees)] = np.array(knees).reshape(-1, len(KNEES)).T
+    cpu = first[:-1] + np.array([len(c.fan_knees) for c in curves], np.int32)
+    return rows, {"first_fan_knee": first, "first_cpu_knee": cpu}
 
 
 def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Array, Array]:
