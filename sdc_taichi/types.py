@@ -115,6 +115,10 @@ class Actions:
     placement: F64 | None = None
     """Relative load of each rack, (R,), or server group, (G,); None weighs all equally. Only
     placement policy ``weights`` accepts it."""
+    chilled_water: float | F64 | None = None
+    """Temperature of the chilled water that leaves the plant, in C, shape () or (B,): at most the
+    coldest supply temperature of the running CRAC units less ``hvac.chiller.coil_approach_k``, and
+    within the range of the chiller model. None gives the warmest water that these limits allow."""
 
 
 @dataclass(slots=True)

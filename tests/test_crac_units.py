@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from sdc_taichi import (
+    Actions,
     OddInputWarning,
+    SdcError,
     Simulator,
     StepResult,
     drivers_from_arrays,
@@ -19,6 +21,7 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.sim.step_inputs import UnitIndex
+from sdc_taichi.types import CoolAction
 
 FOUR = "hvac.crac.units=4"
 N_PLUS_1 = "hvac.crac.spare_units=1"
@@ -320,3 +323,48 @@ def test_fans_that_follow_inlets_settle_where_steady_air_is() -> None:
 def test_units_too_small_for_the_hall_are_told(change: str, said: str) -> None:
     with pytest.warns(OddInputWarning, match=said):
         build_fleet(load_config("corrected", [change]))
+
+
+def run_with_water(chilled_water: object, *overrides: str, setpoints: object = 0.0) -> StepResult:
+    """Result of a step of a batch of two halls of four units in warm weather."""
+    config = load_config("corrected", [FOUR, *overrides])
+    drivers = drivers_from_arrays(*(np.full((2, 1), x) for x in (33.0, 24.0, 300.0, 0.8)))
+    with Simulator([config, config], drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        return sim.step(Actions(cooling=setpoints, chilled_water=chilled_water))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [(), ("hvac.chiller.model=eir_york",), ("hvac.chiller.model=electric_air_cooled",)],
+    ids=["centrifugal", "york", "air_cooled"],
+)
+def test_colder_chilled_water_costs_power_and_changes_no_air(plant: tuple[str, ...]) -> None:
+    usual = run_with_water(None, *plant)
+    same = run_with_water(usual.chilled_water_c, *plant)
+    np.testing.assert_allclose(same.hvac_w, usual.hvac_w, rtol=1e-12)
+    colder = run_with_water([float(usual.chilled_water_c[0]), 5.0], *plant)
+    np.testing.assert_allclose(colder.chilled_water_c, [usual.chilled_water_c[0], 5.0])
+    assert colder.hvac_w[0] == pytest.approx(usual.hvac_w[0], rel=1e-12)
+    assert colder.chiller_w[1] > 1.03 * usual.chiller_w[1]
+    np.testing.assert_array_equal(colder.rack_inlet_c, usual.rack_inlet_c)
+
+
+@pytest.mark.parametrize(
+    ("water", "setpoints", "message"),
+    [
+        (10.1, 0.0, r"action chilled_water of corrected: 10\.1 C; valid is 4\.\.10 C, as the coldest"),
+        ([9.0, 3.0], 0.0, r"action chilled_water of corrected: 3 C; valid is 4\.\.10 C"),
+        # The coldest unit of the second hall is 2 K colder.
+        ([10.0, 9.0], [0, 0, 0, 0, 0, -2, 0, 0], r"chilled_water of corrected: 9 C; valid is 4\.\.8 C"),
+        (np.nan, 0.0, r"action chilled_water: nan; valid is a finite number"),
+        ([9.0] * 3, 0.0, r"action chilled_water: shape \(3,\), expected \(\) or \(2,\)"),
+        ("cold", 0.0, r"action chilled_water: 'cold' are no numbers"),
+        (CoolAction.HOLD, 0.0, r"action chilled_water: CoolAction.HOLD is no number"),
+    ],
+)  # fmt: skip
+def test_chilled_water_that_coils_cannot_use_is_refused(
+    water: object, setpoints: object, message: str
+) -> None:
+    with pytest.raises(SdcError, match=message):
+        run_with_water(water, setpoints=setpoints)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from typing import Any
 
 import gymnasium
@@ -13,9 +14,10 @@ from gymnasium.utils.env_checker import check_env
 
 import random_actions
 import sdc_taichi
-from sdc_taichi import ConfigError, load_config
+from sdc_taichi import Actions, ConfigError, View, load_config
 from sdc_taichi.envs.actions import PLACEMENT_FACTOR
 from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.types import I64
 
 CONTROLLED = load_config(
     "corrected",
@@ -206,3 +208,37 @@ def test_random_actions_of_every_kind_stop_no_batch(preset: str, kind: str) -> N
     envs, steps = (2, 4) if preset == "large" else (16, 50)
     ended = random_actions.play(preset, kind, envs, steps)
     assert ended["length"] == 0
+
+
+class ColdWater:
+    """Commands chilled water of 6 C, but leaves it to the setpoints in the first step."""
+
+    commands = ("chilled_water",)
+
+    def reset(self, seed: int | I64) -> None:
+        """Begin an episode."""
+
+    def act(self, view: View) -> Actions:
+        return Actions(chilled_water=None if view.last is None else 6.0)
+
+
+def test_a_controller_commands_chilled_water_and_its_state_is_saved() -> None:
+    actions = {"agent_bat": np.zeros(2, dtype=np.int64)}
+    with closing(
+        sdc_taichi.vector_env(2, config="tiny", agents=["agent_bat"], others=ColdWater())
+    ) as env:
+        env.reset(seed=1)
+        for water_c in (10.0, 6.0):
+            env.step(actions)
+            last: Any = env.core.view.last
+            assert last.chilled_water_c == pytest.approx([water_c] * 2)
+            saved = env.state_dict()
+            rewards = env.step(actions)[1]["agent_bat"]
+            env.load_state_dict(saved)
+            np.testing.assert_array_equal(env.step(actions)[1]["agent_bat"], rewards)
+            env.load_state_dict(saved)
+
+
+def test_no_agent_learns_chilled_water() -> None:
+    with pytest.raises(ConfigError, match=r"agent_dc: 'chilled_water'"):
+        sdc_taichi.vector_env(2, config="tiny", commands={"agent_dc": ["chilled_water"]})

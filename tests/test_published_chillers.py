@@ -85,6 +85,7 @@ def test_default_needs_the_energy_of_published_curves_in_every_climate() -> None
                 np.full(len(hours), load * it_w[dc]),
                 PlantPoint(
                     setpoint_c=np.full(len(hours), setpoint_c),
+                    water_setpoint_c=np.full(len(hours), setpoint_c),
                     return_c=np.full(len(hours), setpoint_c + 12.0),
                     airflow_m3s=own.tower_air_m3s,
                     outdoor_c=outdoor_c,

@@ -161,6 +161,7 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         ),
         "supply": SimpleNamespace(
             plant_setpoint_c=setpoint_c,
+            water_setpoint_c=setpoint_c - rng.choice([0.0, 2.0], n),
             fan_speed=some(0.3, 1.0),
             coil_share=some(0.3, 1.0),
             coil_limit_w=it_w * some(0.5, 1.5),

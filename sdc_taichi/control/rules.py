@@ -26,7 +26,7 @@ REQUEST_INLET_C = 27.0
 recommends."""
 COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "load": ("load", "placement"),
-    "cooling": ("cooling", "fan", "placement"),
+    "cooling": ("cooling", "fan", "placement", "chilled_water"),
     "battery": ("battery",),
 }
 """Fields of ``Actions`` that each part of ``PerAgent`` may give."""

@@ -13,6 +13,9 @@ Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
 AGENTS: tuple[str, ...] = get_args(Agent)
 """All agents, in the order of their actions and observations in joint environments."""
 
+NOT_LEARNED = {"chilled_water"}
+"""Fields of ``Actions`` that controllers can set, but no agent: their limits depend on the step."""
+
 
 @dataclass(frozen=True, slots=True)
 class AgentDefinition:
@@ -29,6 +32,11 @@ class AgentDefinition:
     @property
     def commands(self) -> tuple[str, ...]:
         """Names of all fields of ``Actions`` that the agent can set, the default field first."""
+        return tuple(name for name in self.controlled if name not in NOT_LEARNED)
+
+    @property
+    def controlled(self) -> tuple[str, ...]:
+        """Names of all fields of ``Actions`` that a controller in place of the agent can set."""
         return COMMANDS_OF_PART[self.command]
 
 
@@ -95,6 +103,6 @@ def commands_by_others(
         command
         for agent, definition in AGENT_DEFINITIONS.items()
         if agent not in agents
-        for command in definition.commands
+        for command in definition.controlled
     )
     return [command for command in settable if command in offered and command not in decided]

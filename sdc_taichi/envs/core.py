@@ -585,7 +585,7 @@ def _check_others(options: EnvOptions, others: Controller) -> None:
     learning = [AGENT_DEFINITIONS[agent] for agent in options.agents]
     learned = [definition.command for definition in learning]
     named = parts_of(options.others) if isinstance(options.others, str) else {}
-    settable = {name for definition in learning for name in definition.commands}
+    settable = {name for definition in learning for name in definition.controlled}
     unused = named.keys() & set(learned) if named else set() < set(commands_of(others)) <= settable
     if unused:
         valid = [d.command for d in AGENT_DEFINITIONS.values() if d not in learning]

@@ -14,6 +14,7 @@ from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.rewards import MAX_PEAK_KW
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
+from sdc_taichi.plant.chiller import BOILING_C, FREEZING_C
 from sdc_taichi.sim.drivers import Drivers, InputReader
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
@@ -209,6 +210,7 @@ COMMAND_LIMITS = {
     "fan": (-MOST_MOVES, MOST_MOVES),
     "placement": (1.0 / PLACEMENT_FACTOR, PLACEMENT_FACTOR),
     "battery": (-1.0, 1.0),
+    "chilled_water": (FREEZING_C, BOILING_C),
 }
 """Minimum and maximum of each command of an agent or a controller, by field of ``Actions``."""
 
@@ -312,13 +314,13 @@ def _checked_commands(
 ) -> dict[str, F64] | None:
     """Check the saved commands of the last step, (), (B,), (U,) or (R,) each.
 
-    None stands for a state before the first step. A controller may leave the commands ``cooling``
-    and ``placement`` at None; the saved state then lacks them.
+    None stands for a state before the first step. A controller may leave the commands ``cooling``,
+    ``placement`` and ``chilled_water`` at None; the saved state then lacks them.
     """
     if saved is None:
         return None
     names = [*learned, *by_others]
-    optional = {"cooling", "placement"}.intersection(by_others)
+    optional = {"cooling", "placement", "chilled_water"}.intersection(by_others)
     if not set(names) - optional <= set(saved) <= set(names):
         raise SdcError(
             f"state: actions are {shortened(sorted(saved))}; valid is a dict of {sorted(names)}"

@@ -26,8 +26,8 @@ from sdc_taichi.types import F64, Values
 
 KELVIN = 273.15
 """Temperature of 0 C, in K."""
-BOILING_C = 100.0
-"""Highest chilled-water temperature for models without bounds, in C."""
+FREEZING_C, BOILING_C = 0.0, 100.0
+"""Range of the chilled water of models without bounds, in C."""
 
 # York YT 1055 kW / 5.96 COP, inlet vanes: biquadratics in (1, Te, Te^2, Tc, Tc^2, Te*Tc), C.
 YORK_CAPACITY = (
@@ -145,9 +145,14 @@ class ChillerModel:
     None allows any value."""
 
     @property
+    def water_range_c(self) -> tuple[float, float]:
+        """Lowest and highest chilled-water temperature that may be commanded, in C."""
+        return self.chilled_water_bounds_c or (FREEZING_C, BOILING_C)
+
+    @property
     def warmest_water_c(self) -> float:
         """Highest chilled-water temperature of a plant with this chiller, in C."""
-        return BOILING_C if self.chilled_water_bounds_c is None else self.chilled_water_bounds_c[1]
+        return self.water_range_c[1]
 
     def step(self, load_w: Values, point: ChillerPoint) -> ChillerResult:
         """Compute one step of the chillers of B data centers.

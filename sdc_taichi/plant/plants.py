@@ -36,6 +36,9 @@ class PlantPoint(NamedTuple):
 
     setpoint_c: F64
     """CRAC supply setpoint, in C, (B,)."""
+    water_setpoint_c: F64
+    """Supply temperature that the chilled water is cold enough for, in C, (B,): the setpoint, or
+    lower if colder water is commanded."""
     return_c: F64
     """Return air temperature of the CRAC units, in C, (B,)."""
     airflow_m3s: F64
@@ -82,7 +85,7 @@ def water_cooled(
     # Running tower cells take over the water of failed ones, but the capacity per cell is limited.
     capacity_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
     load_w = np.minimum(requested_w, capacity_w) if devices.limited else requested_w
-    chilled_c = chilled_water_c(point.setpoint_c, design)
+    chilled_c = chilled_water_c(point.water_setpoint_c, design)
 
     def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
         load_w = taken_w * (1.0 - economiser)
@@ -181,7 +184,7 @@ def air_cooled(
     fourth power of the heat relative to full speed.
     """
     load_w = np.minimum(requested_w, design.pumped_w) if devices.limited else requested_w
-    chilled_c = chilled_water_c(point.setpoint_c, design)
+    chilled_c = chilled_water_c(point.water_setpoint_c, design)
     taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
     range_k = design.chilled_water_range_k * range_ratio
     over_k = np.maximum(chilled_c + range_k - point.outdoor_c, 0.0)
@@ -223,7 +226,7 @@ def air_side(
     the heat of these fans leaves with the exhaust air.
     """
     load_w = np.minimum(requested_w, design.cooling_w) if devices.limited else requested_w
-    chilled_c = chilled_water_c(point.setpoint_c, design)
+    chilled_c = chilled_water_c(point.water_setpoint_c, design)
     vapour_pa = _vapour_pa(point.outdoor_c, point.wet_bulb_c, design.pressure_pa)
     ratio, least = (
         moist_air.vapour_ratio(pa, design.pressure_pa) for pa in (vapour_pa, design.least_vapour_pa)

@@ -9,12 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config.hvac_schema import SetpointConfig
+from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.unit_supply import airflow_with_losses_m3s, unit_weights, weighted_shares
 from sdc_taichi.plant import cooling
+from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.sim.drivers import FleetSeries, fleet_series
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.step_inputs import Commands, Surroundings, UnitIndex
 from sdc_taichi.types import F64, I64, SetpointQuantities, State
+
+ROUNDING_K = 1e-9
+"""Difference up to which a commanded temperature may exceed its limit, in K."""
 
 
 @dataclass
@@ -35,8 +40,10 @@ class Supply(SetpointQuantities):
     unit_high: F64
     """Maximum speed of each fan in this step, as a share of full speed, (U,)."""
     plant_setpoint_c: F64
-    """Coldest supply temperature of the running units, in C, (B,); it sets the temperature of the
-    chilled water."""
+    """Coldest supply temperature of the running units, in C, (B,)."""
+    water_setpoint_c: F64
+    """Supply temperature that the chilled water is cold enough for, in C, (B,):
+    ``plant_setpoint_c``, or lower if an action commands colder water."""
     coil_limit_w: F64
     """Total coil capacity of the running units, in W, (B,)."""
     coil_share: F64
@@ -71,6 +78,9 @@ class CracUnits:
         self._setpoint_over_supply_k = fleet.setpoint_over_supply_k[units.dc]
         self._capacity_w = fleet.unit_capacity_w
         self._full_m3s, self._design_m3s = fleet.unit_design_m3s, fleet.design_flow_m3s
+        self._names, self._chiller = fleet.names, fleet.models["chiller"]
+        self._coil_approach_k = fleet.values("hvac.chiller.coil_approach_k")
+        self._water_range_c = CHILLERS[self._chiller].water_range_c
         self._ones, full_speed = np.ones(fleet.size), np.ones(fleet.units)
         self._design_speed = fleet.design_speed[units.dc]
         flow_model = fleet.models["crac_flow"]
@@ -85,6 +95,7 @@ class CracUnits:
         n_units = len(self._initial_c)
         setpoint_c = self._initial_c.copy()
         low, high = self._free_range
+        coldest_c = self._units.lowest(self.coldest_supply_c(setpoint_c))
         return Supply(
             unit_setpoint_c=setpoint_c,
             coldest_supply_c=self.coldest_supply_c(setpoint_c),
@@ -94,7 +105,8 @@ class CracUnits:
             fan_speed=self._design_speed.copy(),
             unit_low=low,
             unit_high=high,
-            plant_setpoint_c=self._units.lowest(self.coldest_supply_c(setpoint_c)),
+            plant_setpoint_c=coldest_c,
+            water_setpoint_c=coldest_c,
             coil_limit_w=self._units.sum(self._capacity_w),
             coil_share=self._ones,
         )
@@ -108,8 +120,12 @@ class CracUnits:
 
         Args:
             state: State at the start of the step.
-            commands: Commands for setpoints and fans.
+            commands: Commands for setpoints, fans and chilled water.
             surroundings: Surroundings of the step, of which the running units are read.
+
+        Raises:
+            SdcError: The commanded chilled water is too warm for the setpoints, or outside the
+                range of the chiller model.
         """
         unit_setpoint_c, cooling_run, cooling_last = self._setpoint_model(
             state.setpoint_c,
@@ -135,9 +151,36 @@ class CracUnits:
             unit_low=unit_low,
             unit_high=unit_high,
             plant_setpoint_c=plant_setpoint_c,
+            water_setpoint_c=self._water_setpoint_c(plant_setpoint_c, commands.chilled_water_command_c),
             coil_limit_w=coil_limit_w,
             coil_share=coil_share,
         )
+
+    def _water_setpoint_c(self, plant_setpoint_c: F64, chilled_water_c: F64 | None) -> F64:
+        """Return the supply temperature that the chilled water is cold enough for, in C, (B,).
+
+        Args:
+            plant_setpoint_c: Coldest supply temperature of the running units, in C, (B,).
+            chilled_water_c: Commanded water temperature, in C, (B,); None follows the setpoints.
+
+        Raises:
+            SdcError: The water is too warm for the setpoints, or outside the chiller's range.
+        """
+        if chilled_water_c is None:
+            return plant_setpoint_c
+        low_c, high_c = self._water_range_c
+        most_c = np.minimum(plant_setpoint_c - self._coil_approach_k, high_c)
+        valid = (chilled_water_c >= low_c) & (chilled_water_c <= most_c + ROUNDING_K)
+        if not np.all(valid):
+            dc = int(np.argmin(valid))
+            of_dc = f" of {self._names[dc]}" if len(valid) > 1 else ""
+            raise SdcError(
+                f"action chilled_water{of_dc}: {chilled_water_c[dc]:g} C; valid is {low_c:g}.."
+                f"{most_c[dc]:g} C, as the coldest supply air is {plant_setpoint_c[dc]:g} C, "
+                f"hvac.chiller.coil_approach_k {self._coil_approach_k[dc]:g} K, and chiller "
+                f"{self._chiller} makes water of {low_c:g}..{high_c:g} C"
+            )
+        return np.asarray(chilled_water_c + self._coil_approach_k)
 
     def _moved_fans(self, fan_speed: F64, command: F64 | None) -> F64:
         """Return the speed of each fan after its command, as a share of full speed, (U,)."""

@@ -263,6 +263,7 @@ class Facility:
             )
         point = PlantPoint(
             setpoint_c=supply.plant_setpoint_c,
+            water_setpoint_c=supply.water_setpoint_c,
             return_c=return_c,
             airflow_m3s=airflow_m3s,
             outdoor_c=surroundings.outdoor_c,

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.plant.chiller import BOILING_C
 from sdc_taichi.sim.events import Disturbance
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import (
@@ -79,6 +80,8 @@ class Commands(CommandQuantities):
     """Commanded change of each CRAC fan's speed, in fan steps, (U,); None holds all speeds."""
     group_weights: F64 | None
     """Relative load of each server group, (G,); None weighs all groups equally."""
+    chilled_water_command_c: F64 | None
+    """Commanded temperature of the chilled water, in C, (B,); None follows the setpoints."""
 
 
 class ActionDecoder:
@@ -120,6 +123,7 @@ class ActionDecoder:
             follows_schedule=wanted.cooling is None,
             unit_fan_command=self._fan_command(wanted.fan),
             group_weights=self._group_weights(wanted.placement),
+            chilled_water_command_c=self._chilled_water_command_c(wanted.chilled_water),
         )
 
     def _fan_command(self, action: Any) -> F64 | None:
@@ -134,6 +138,12 @@ class ActionDecoder:
                 "HOLD, or flow model controlled"
             )
         return None
+
+    def _chilled_water_command_c(self, action: Any) -> F64 | None:
+        """Return the commanded water temperature, in C, (B,); ``CracUnits`` checks its limits."""
+        if action is None:
+            return None
+        return self._command("chilled_water", action, None, limit=BOILING_C)
 
     def _group_weights(self, placement: Any) -> F64 | None:
         """Return weights of the server groups, (G,), from weights per rack or per group."""
@@ -167,7 +177,7 @@ class ActionDecoder:
         self,
         name: str,
         action: Any,
-        kind: type[Enum],
+        kind: type[Enum] | None,
         *,
         limit: float,
         also: int | None = None,
@@ -177,17 +187,17 @@ class ActionDecoder:
         Every entry is checked to be finite and within -limit..limit.
         """
         if isinstance(action, Enum):
-            if not isinstance(action, kind):
-                raise SdcError(f"action {name}: {action} is no {kind.__name__}")
+            if kind is None or not isinstance(action, kind):
+                valid = "number" if kind is None else kind.__name__
+                raise SdcError(f"action {name}: {action} is no {valid}")
             return np.full(self._size, float(action.value))
         if isinstance(action, list | tuple) and any(isinstance(x, Enum) for x in action):
-            action = [x.value if isinstance(x, kind) else x for x in action]
+            action = [x.value if kind is not None and isinstance(x, kind) else x for x in action]
         try:
             command = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise SdcError(
-                f"action {name}: {action!r} is neither {kind.__name__} nor numbers"
-            ) from None
+            valid = "are no" if kind is None else f"is neither {kind.__name__} nor"
+            raise SdcError(f"action {name}: {action!r} {valid} numbers") from None
         if command.shape not in ((), (self._size,), (also,)):
             valid = dict.fromkeys([(), (self._size,), *([] if also is None else [(also,)])])
             raise SdcError(
