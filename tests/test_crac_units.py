@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -331,7 +333,8 @@ def run_with_water(chilled_water: object, *overrides: str, setpoints: object = 0
     drivers = drivers_from_arrays(*(np.full((2, 1), x) for x in (33.0, 24.0, 300.0, 0.8)))
     with Simulator([config, config], drivers=drivers, precision="f64") as sim:
         sim.reset()
-        return sim.step(Actions(cooling=setpoints, chilled_water=chilled_water))  # type: ignore[arg-type]
+        commands: dict[str, Any] = {"cooling": setpoints, "chilled_water": chilled_water}
+        return sim.step(Actions(**commands))
 
 
 @pytest.mark.parametrize(
@@ -353,18 +356,18 @@ def test_colder_chilled_water_costs_power_and_changes_no_air(plant: tuple[str, .
 @pytest.mark.parametrize(
     ("water", "setpoints", "message"),
     [
-        (10.1, 0.0, r"action chilled_water of corrected: 10\.1 C; valid is 4\.\.10 C, as the coldest"),
-        ([9.0, 3.0], 0.0, r"action chilled_water of corrected: 3 C; valid is 4\.\.10 C"),
+        (10.1, 0.0, r"of corrected: 10\.1 C; valid is 4\.\.10 C, as the coldest supply"),
+        ([9.0, 3.0], 0.0, r"of corrected: 3 C; valid is 4\.\.10 C"),
         # The coldest unit of the second hall is 2 K colder.
-        ([10.0, 9.0], [0, 0, 0, 0, 0, -2, 0, 0], r"chilled_water of corrected: 9 C; valid is 4\.\.8 C"),
-        (np.nan, 0.0, r"action chilled_water: nan; valid is a finite number"),
-        ([9.0] * 3, 0.0, r"action chilled_water: shape \(3,\), expected \(\) or \(2,\)"),
-        ("cold", 0.0, r"action chilled_water: 'cold' are no numbers"),
-        (CoolAction.HOLD, 0.0, r"action chilled_water: CoolAction.HOLD is no number"),
+        ([10.0, 9.0], [0, 0, 0, 0, 0, -2, 0, 0], r"of corrected: 9 C; valid is 4\.\.8 C"),
+        (np.nan, 0.0, r": nan; valid is a finite number"),
+        ([9.0] * 3, 0.0, r": shape \(3,\), expected \(\) or \(2,\)"),
+        ("cold", 0.0, r": 'cold' are no numbers"),
+        (CoolAction.HOLD, 0.0, r": CoolAction.HOLD is no number"),
     ],
-)  # fmt: skip
+)
 def test_chilled_water_that_coils_cannot_use_is_refused(
     water: object, setpoints: object, message: str
 ) -> None:
-    with pytest.raises(SdcError, match=message):
+    with pytest.raises(SdcError, match="action chilled_water ?" + message):
         run_with_water(water, setpoints=setpoints)

@@ -151,7 +151,9 @@ class CracUnits:
             unit_low=unit_low,
             unit_high=unit_high,
             plant_setpoint_c=plant_setpoint_c,
-            water_setpoint_c=self._water_setpoint_c(plant_setpoint_c, commands.chilled_water_command_c),
+            water_setpoint_c=self._water_setpoint_c(
+                plant_setpoint_c, commands.chilled_water_command_c
+            ),
             coil_limit_w=coil_limit_w,
             coil_share=coil_share,
         )
