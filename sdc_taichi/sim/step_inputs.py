@@ -188,16 +188,16 @@ class ActionDecoder:
         """
         if isinstance(action, Enum):
             if kind is None or not isinstance(action, kind):
-                valid = "number" if kind is None else kind.__name__
-                raise SdcError(f"action {name}: {action} is no {valid}")
+                wanted = "number" if kind is None else kind.__name__
+                raise SdcError(f"action {name}: {action} is no {wanted}")
             return np.full(self._size, float(action.value))
         if isinstance(action, list | tuple) and any(isinstance(x, Enum) for x in action):
             action = [x.value if kind is not None and isinstance(x, kind) else x for x in action]
         try:
             command = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
-            valid = "are no" if kind is None else f"is neither {kind.__name__} nor"
-            raise SdcError(f"action {name}: {action!r} {valid} numbers") from None
+            fault = "are no" if kind is None else f"is neither {kind.__name__} nor"
+            raise SdcError(f"action {name}: {action!r} {fault} numbers") from None
         if command.shape not in ((), (self._size,), (also,)):
             valid = dict.fromkeys([(), (self._size,), *([] if also is None else [(also,)])])
             raise SdcError(
