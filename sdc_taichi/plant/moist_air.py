@@ -29,6 +29,8 @@ SATURATION_BOUNDS_C = (-40.0, 35.0)
 """Lowest and highest temperature at which the saturation pressure is evaluated, in C."""
 _SATURATION_PA = (605.455, 46.1143, 1.39563, 0.0234096, 0.000343549, 3.52573e-06)
 """Coefficients of the saturation pressure in powers of the temperature in C; error at most 6 Pa."""
+FREEZING_BAND_K = 0.2
+"""Range of the wet bulb below 0 C within which a wick counts as partly frozen, in K."""
 ENTHALPY_BOUNDS_KJ_PER_KG = (-15.0, 260.0)
 """Lowest and highest enthalpy at which the temperature of saturated air is evaluated, in kJ per kg
 of dry air; at sea level they correspond to -21 C and 57 C."""
@@ -103,14 +105,18 @@ def saturated_ratio_by_enthalpy(enthalpy_j_per_kg: Values, pressure_pa: Values) 
 def humidity_ratio(outdoor_c: Values, wet_bulb_c: Values, at_wet_bulb: Values) -> Values:
     """Return the humidity ratio from dry bulb and wet bulb, in kg/kg (eq. 33; eq. 35 below 0 C).
 
+    The two equations, for a wick of water and of ice, differ at 0 C. The ratio changes from one to
+    the other within ``FREEZING_BAND_K`` below 0 C.
+
     Args:
         outdoor_c: Dry-bulb temperature, C.
         wet_bulb_c: Wet-bulb temperature, C.
         at_wet_bulb: Humidity ratio of saturated air at the wet-bulb temperature, kg/kg.
     """
-    ice = np.less(wet_bulb_c, 0.0)
-    vapour = np.where(ice, 2830.0 - 0.24 * wet_bulb_c, 2501.0 - 2.326 * wet_bulb_c)
-    of_water = np.where(ice, 2.1 * wet_bulb_c - 329.0, 4.186 * wet_bulb_c)
+    ice = np.clip(-wet_bulb_c / FREEZING_BAND_K, 0.0, 1.0)
+    water = 1.0 - ice
+    vapour = ice * (2830.0 - 0.24 * wet_bulb_c) + water * (2501.0 - 2.326 * wet_bulb_c)
+    of_water = ice * (2.1 * wet_bulb_c - 329.0) + water * (4.186 * wet_bulb_c)
     taken_up = vapour * at_wet_bulb - 1.006 * (outdoor_c - wet_bulb_c)
     return np.maximum(taken_up / (2501.0 + 1.86 * outdoor_c - of_water), 0.0)
 

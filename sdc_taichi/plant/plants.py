@@ -24,11 +24,15 @@ from sdc_taichi.plant.water_side import (
     economiser_share,
     loop_pump_w,
 )
-from sdc_taichi.types import F64, Values, WaterSideResult, as_array
+from sdc_taichi.types import F64, Values, WaterSideResult, as_array, fields_of
 
 _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
 """Temperature drop of air by adiabatic humidification, divided by the rise of its humidity ratio in
 kg/kg; in K."""
+_DAMPER_BAND = 0.1
+"""Proportional band of the dampers of outdoor air, as a share of the vapour pressure at a limit."""
+_LEAST_W, _LEAST_K, _LEAST_M3S = 1e-3, 1e-3, 1e-9
+"""Lower bounds of divisors that are a power, a temperature difference or an airflow."""
 
 
 class PlantPoint(NamedTuple):
@@ -172,7 +176,7 @@ def air_cooled(
 
     The dry cooler precools the return water through a heat exchanger upstream of the chiller. The
     cooler is sized to carry the full load at full fan speed, with water leaving at the design
-    approach above outdoor air. At constant effectiveness its share of the load is
+    approach above outdoor air. At constant effectiveness its share of the load is at most
 
         share = clip((T_return - T_outdoor)/(range + approach), 0, 1)
 
@@ -180,8 +184,10 @@ def air_cooled(
     because no water leaves colder than the outdoor air.
 
     At lower fan speed the heat is proportional to the airflow to the power 3/4 (film coefficient),
-    and the fan power to the airflow cubed. The fan power relative to full speed is therefore the
-    fourth power of the heat relative to full speed.
+    and the fan power to the airflow cubed. The fan power P is therefore the fourth power of the
+    heat q, both relative to full speed. A chiller that draws c watts per watt of heat makes the
+    speed worthwhile up to which 4 P_full q^3 = c Q_full. ``_worthwhile`` decides whether the cooler
+    runs at all.
     """
     load_w = np.minimum(requested_w, design.pumped_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
@@ -191,22 +197,34 @@ def air_cooled(
     full_range_k = design.chilled_water_range_k + design.dry_cooler_approach_k
     cooler_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
     full_speed_w = design.economiser * design.outdoor_units * cooler_w * over_k / full_range_k
-    share = np.minimum(over_k / np.maximum(full_range_k, range_k), 1.0)
-    free_w = np.minimum(taken_w * share, full_speed_w)
-    speed_share = free_w / np.maximum(full_speed_w, 1.0)
-    left_w = taken_w - free_w
-    machine = _run_chiller(left_w, chilled_c, point.outdoor_c, point, design, devices)
-    return _dry(
-        _removed_w(load_w, machine, devices),
-        free_w=free_w,
-        chiller_load_w=machine.evaporator_w if devices.limited else left_w,
-        machine=machine,
-        chilled_c=chilled_c,
-        outdoor_c=point.outdoor_c,
-        fan_w=design.tower_fan_w * design.outdoor_units * speed_share**4,
-        chilled_pump_w=chilled_pump_w,
-        condenser_pump_w=loop_pump_w(free_w, cooler_w, design.condenser_pump_w, design),
+    full_fan_w = design.tower_fan_w * design.outdoor_units
+
+    def run(free_w: F64) -> WaterSideResult:
+        left_w = taken_w - free_w
+        machine = _run_chiller(left_w, chilled_c, point.outdoor_c, point, design, devices)
+        return _dry(
+            _removed_w(load_w, machine, devices),
+            free_w=free_w,
+            chiller_load_w=machine.evaporator_w if devices.limited else left_w,
+            machine=machine,
+            chilled_c=chilled_c,
+            outdoor_c=point.outdoor_c,
+            fan_w=full_fan_w * (free_w / np.maximum(full_speed_w, _LEAST_W)) ** 4,
+            chilled_pump_w=chilled_pump_w,
+            condenser_pump_w=loop_pump_w(free_w, cooler_w, design.condenser_pump_w, design),
+        )
+
+    without = run(0.0 * taken_w)
+    worth = _chiller_w_per_w(without) * full_speed_w / np.maximum(4.0 * full_fan_w, _LEAST_W)
+    # Square roots give the power 5/16 for the cube root, which no compiled stage has.
+    root = np.sqrt(np.sqrt(worth))
+    worthwhile_w = full_speed_w * root * np.sqrt(np.sqrt(root))
+    most_w = np.minimum(
+        taken_w * np.minimum(over_k / np.maximum(full_range_k, range_k), 1.0), full_speed_w
     )
+    short_w = load_w - without.heat_removed_w
+    with_free = run(np.minimum(most_w, np.maximum(worthwhile_w, short_w)))
+    return _mixed(without, with_free, _worthwhile(without, with_free, short_w))
 
 
 def air_side(
@@ -218,12 +236,21 @@ def air_side(
 
         heat = rho V_outdoor (cp (T_return - T_outdoor) + h_fg (w_least - w_outdoor))
 
-    Outdoor air is used only if its moisture is within the configured limits of dew point and of
-    relative humidity at the supply setpoint. Air that is too dry is not used, unless an adiabatic
-    humidifier raises it to the lowest dew point (second term). While coils also cool, the dew point
-    must be below the chilled-water temperature, so that nothing condenses and the coils remove
-    sensible heat only. The power of the fans for outdoor and exhaust air follows the affinity law;
-    the heat of these fans leaves with the exhaust air.
+    Air that is drier than the lowest dew point is wetted by an adiabatic humidifier (second term),
+    or stays outside if there is none. A hall contains no source of moisture, so its supply air
+    takes on the moisture of the outdoor air. The dampers close gradually towards the limits of dew
+    point and of relative humidity at the supply setpoint, see ``_admitted_share``.
+
+    Moisture of outdoor air that condenses on coils at the chilled-water temperature is a load of
+    the chiller. Coils that remove the heat Q bring the airflow V_c = Q/(rho cp (T_inlet -
+    T_chilled)) to the temperature of their water, and the balance of moisture gives
+
+        latent = rho h_fg (w_outdoor - w_saturated) V_outdoor V_c/(V_outdoor + V_c)
+
+    The power of the fans for outdoor and exhaust air follows the affinity law; the heat of these
+    fans leaves with the exhaust air. A chiller that draws c watts per watt of heat makes the
+    airflow worthwhile at which the fans draw c watts more per watt of heat. ``_worthwhile`` decides
+    whether outdoor air enters at all.
     """
     load_w = np.minimum(requested_w, design.cooling_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
@@ -232,37 +259,51 @@ def air_side(
         moist_air.vapour_ratio(pa, design.pressure_pa) for pa in (vapour_pa, design.least_vapour_pa)
     )
     lack = design.humidifier * np.maximum(least - ratio, 0.0)
-    over_k = np.maximum(point.return_c - point.outdoor_c, 0.0)
-    over_w_s_m3 = design.air_j_per_m3_k * (over_k + lack * _WETTING_K)
-    max_m3s = np.minimum(point.airflow_m3s, design.tower_air_m3s * design.outdoor_units)
+    cooler_k = point.return_c - point.outdoor_c + lack * _WETTING_K
+    over_w_s_m3 = design.air_j_per_m3_k * np.maximum(cooler_k, 0.0)
+    wetter = np.maximum(ratio - moist_air.saturated_ratio(chilled_c, design.pressure_pa), 0.0)
+    wetter_w_s_m3 = design.air_j_per_m3_k * wetter * _WETTING_K
     units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
-    reachable_w = np.where(over_k > 0.0, max_m3s * over_w_s_m3, 0.0)
-    within = (
-        ((vapour_pa >= design.least_vapour_pa) | (design.humidifier > 0.0))
-        & (vapour_pa <= design.most_vapour_pa)
-        & (vapour_pa <= design.most_humidity * moist_air.saturation_pa(point.setpoint_c))
+    full_m3s, full_fan_w = design.tower_air_m3s * units, design.tower_fan_w * units
+
+    def run(outdoor_m3s: F64) -> WaterSideResult:
+        free_w = outdoor_m3s * over_w_s_m3
+        coil_w = load_w - free_w
+        if devices.limited:
+            coil_w = np.minimum(coil_w, design.pumped_w)
+        mixed_c = point.return_c - free_w / (design.air_j_per_m3_k * point.airflow_m3s)
+        cooled_k = np.maximum(np.maximum(mixed_c, point.setpoint_c) - chilled_c, _LEAST_K)
+        dried_m3s = np.maximum(coil_w, 0.0) / (design.air_j_per_m3_k * cooled_k)
+        total_m3s = np.maximum(outdoor_m3s + dried_m3s, _LEAST_M3S)
+        latent_w = wetter_w_s_m3 * outdoor_m3s * dried_m3s / total_m3s
+        taken_w, chilled_pump_w, _ = chilled_water_load_w(coil_w + latent_w, design)
+        machine = _run_chiller(taken_w, chilled_c, point.outdoor_c, point, design, devices)
+        wetted_kg_s = lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K
+        return _dry(
+            free_w + _removed_w(coil_w, machine, devices),
+            free_w=free_w - latent_w,
+            chiller_load_w=machine.evaporator_w if devices.limited else taken_w,
+            machine=machine,
+            chilled_c=chilled_c,
+            outdoor_c=point.outdoor_c,
+            fan_w=full_fan_w * (outdoor_m3s / full_m3s) ** 3,
+            humidifier_kg_s=wetted_kg_s,
+            chilled_pump_w=chilled_pump_w,
+            condenser_pump_w=0.0 * load_w,
+        )
+
+    without = run(0.0 * load_w)
+    short_w = load_w - without.heat_removed_w
+    worth = _chiller_w_per_w(without) * over_w_s_m3 * full_m3s
+    worthwhile_m3s = full_m3s * np.sqrt(worth / np.maximum(3.0 * full_fan_w, _LEAST_W))
+    per_m3s_w = np.maximum(over_w_s_m3, _LEAST_K * design.air_j_per_m3_k)
+    wanted_m3s = np.minimum(
+        np.maximum(load_w, 0.0) / per_m3s_w, np.maximum(worthwhile_m3s, short_w / per_m3s_w)
     )
-    dry_coil = vapour_pa <= moist_air.saturation_pa(chilled_c)
-    let_in = within & (dry_coil | (reachable_w >= load_w))
-    free_w = np.where(let_in, np.minimum(np.maximum(load_w, 0.0), reachable_w), 0.0)
-    outdoor_m3s = free_w / np.maximum(over_w_s_m3, design.air_j_per_m3_k * 1e-3)
-    coil_w = load_w - free_w
-    if devices.limited:
-        coil_w = np.minimum(coil_w, design.pumped_w)
-    taken_w, chilled_pump_w, _ = chilled_water_load_w(coil_w, design)
-    machine = _run_chiller(taken_w, chilled_c, point.outdoor_c, point, design, devices)
-    return _dry(
-        free_w + _removed_w(coil_w, machine, devices),
-        free_w=free_w,
-        chiller_load_w=machine.evaporator_w if devices.limited else taken_w,
-        machine=machine,
-        chilled_c=chilled_c,
-        outdoor_c=point.outdoor_c,
-        fan_w=design.tower_fan_w * units * (outdoor_m3s / (design.tower_air_m3s * units)) ** 3,
-        humidifier_kg_s=lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K,
-        chilled_pump_w=chilled_pump_w,
-        condenser_pump_w=0.0 * load_w,
-    )
+    most_m3s = np.minimum(point.airflow_m3s, design.tower_air_m3s * design.outdoor_units)
+    with_free = run(np.minimum(wanted_m3s, most_m3s))
+    admitted = _admitted_share(vapour_pa, point.setpoint_c, design)
+    return _mixed(without, with_free, admitted * _worthwhile(without, with_free, short_w))
 
 
 PLANTS: dict[str, PlantModel] = {
@@ -302,6 +343,57 @@ def _run_chiller(
             machine=design.machine,
         ),
     )
+
+
+def _chiller_w_per_w(result: WaterSideResult) -> F64:
+    """Return the chiller power divided by the heat that the chiller removes, in W/W, (B,)."""
+    return result.chiller_w / np.maximum(result.chiller_load_w, _LEAST_W)
+
+
+def _worthwhile(without: WaterSideResult, with_free: WaterSideResult, short_w: F64) -> F64:
+    """Return the share of the step during which a plant uses free cooling, 0..1, (B,).
+
+    Free cooling runs all the time if the plant then needs less power. Otherwise it runs only as
+    long as is necessary to remove ``short_w``, the heat in W, (B,), that the chiller alone cannot
+    remove. The power of the plant is therefore never above its power without free cooling, unless
+    the chiller is too small, and it changes without steps.
+    """
+    gain_w = with_free.heat_removed_w - without.heat_removed_w
+    needed = np.clip(short_w / np.maximum(gain_w, _LEAST_W), 0.0, 1.0)
+    return np.where(_power_w(with_free) < _power_w(without), 1.0, needed)
+
+
+def _power_w(result: WaterSideResult) -> F64:
+    """Return the power of all devices of a plant, in W, (B,)."""
+    pumps_w = result.chilled_pump_w + result.condenser_pump_w
+    return as_array(result.chiller_w + result.tower_fan_w + pumps_w)
+
+
+def _mixed(without: WaterSideResult, with_free: WaterSideResult, share: F64) -> WaterSideResult:
+    """Return the means over a step during a share of which, (B,), a plant uses free cooling."""
+    first, second = fields_of(without), fields_of(with_free)
+    return WaterSideResult(
+        **{name: (1.0 - share) * first[name] + share * second[name] for name in first}
+    )
+
+
+def _admitted_share(vapour_pa: F64, setpoint_c: F64, design: WaterSideDesign) -> F64:
+    """Return the share of the step during which the dampers admit outdoor air, 0..1, (B,).
+
+    The supply air has the vapour pressure of the outdoor air and the temperature of the setpoint.
+    The dampers are shut at the limits of dew point and relative humidity. They open over the tenth
+    of the vapour pressure next to a limit, which is 7 points of relative humidity at a limit of
+    70 %, and 1.6 K of dew point at 15 C. Near their open position they move slowly, because the
+    first chillers that start again cost most.
+    """
+    most_pa = np.minimum(
+        design.most_vapour_pa, design.most_humidity * moist_air.saturation_pa(setpoint_c)
+    )
+    least_pa = design.least_vapour_pa
+    humid = np.clip((most_pa - vapour_pa) / (_DAMPER_BAND * most_pa), 0.0, 1.0)
+    dry = np.clip((vapour_pa - least_pa) / (_DAMPER_BAND * least_pa), 0.0, 1.0)
+    opened = humid * np.maximum(dry, design.humidifier)
+    return as_array(opened * (2.0 - opened))
 
 
 def _removed_w(load_w: F64, machine: ChillerResult, devices: Devices) -> F64:

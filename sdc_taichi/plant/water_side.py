@@ -14,6 +14,8 @@ from sdc_taichi.types import F64, Values, as_array
 
 LEAST_COIL_LOAD = 0.1
 """Coil load divided by design load below which the chilled-water range no longer changes."""
+CYCLING_BELOW = 0.05
+"""Heat of a water loop divided by its design heat below which its pumps cycle on and off."""
 LEAST_OUTDOOR_UNITS = 0.01
 """Lower bound of the share of outdoor units in equations that divide by it."""
 
@@ -163,7 +165,8 @@ def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSid
     """Return the pump power of a loop whose flow is proportional to its heat, in W, (B,).
 
     By the affinity law, power is proportional to the cube of the flow (ASHRAE Handbook, HVAC
-    Systems and Equipment, chapter "Centrifugal pumps"), down to the lowest flow of the pumps.
+    Systems and Equipment, chapter "Centrifugal pumps"), down to the lowest flow of the pumps. For
+    less heat than ``CYCLING_BELOW`` of design, the pumps cycle on and off, like the chiller.
 
     Args:
         heat_w: Heat that the loop would carry at its flow and design range, W, (B,); the pumps are
@@ -172,9 +175,10 @@ def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSid
         design_w: Power of the pumps at design flow, W, (B,).
         design: Sized devices.
     """
-    running = np.greater(heat_w, 0.0)
-    flow_ratio = np.maximum(heat_w / design_heat_w, design.pump_min_ratio)
-    return as_array(np.where(running, design_w * flow_ratio**3, 0.0))
+    heat_ratio = np.maximum(heat_w / design_heat_w, 0.0)
+    flow_ratio = np.maximum(heat_ratio, design.pump_min_ratio)
+    on_share = np.minimum(heat_ratio / CYCLING_BELOW, 1.0)
+    return as_array(on_share * (design_w * flow_ratio**3))
 
 
 def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64, F64]:
