@@ -283,7 +283,7 @@ SWEPT = [
 of their sources."""
 STEP_K, STEP_LOAD, LARGEST_JUMP = 0.002, 2e-4, 0.005
 LARGEST_JUMP_OF_DAMPERS = 0.015
-"""Where dampers close for humid air; without their band, power would jump to many times its value."""
+"""Where dampers close for humid air: without their band, power would jump to several times."""
 
 
 class Swept(NamedTuple):
