@@ -333,13 +333,19 @@ def hvac_w(names: tuple[str, str, str], at: Swept, *, free: bool = True) -> F64:
     rise_k = load_w / (design.air_j_per_m3_k * speed * sizing.crac_flow_m3s)
     plant = PLANTS[names[0]].step(
         load_w,
-        PlantPoint(setpoint_c, setpoint_c + rise_k, speed * sizing.crac_flow_m3s, outdoor_c,
-                   outdoor_c - depression_k),
+        PlantPoint(
+            setpoint_c=setpoint_c,
+            water_setpoint_c=setpoint_c,
+            return_c=setpoint_c + rise_k,
+            airflow_m3s=speed * sizing.crac_flow_m3s,
+            outdoor_c=outdoor_c,
+            wet_bulb_c=outdoor_c - depression_k,
+        ),
         design,
         Devices(CHILLERS[names[1]], TOWERS[names[2]], limited=True),
-    )  # fmt: skip
+    )
     pumps_w = plant.chilled_pump_w + plant.condenser_pump_w
-    return plant.chiller_w + plant.tower_fan_w + pumps_w + sizing.crac_fan_w * speed**3
+    return np.asarray(plant.chiller_w + plant.tower_fan_w + pumps_w + sizing.crac_fan_w * speed**3)
 
 
 def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
