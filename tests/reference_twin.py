@@ -6,9 +6,9 @@ independent way to the same numbers.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,9 @@ def airflow_ratio(config: DataCenterConfig, inlet_c: F64, load: F64) -> F64:
     return np.asarray(np.clip(ratio, low, high))
 
 
+_pressure_pa = functools.cache(site_pressure_pa)
+
+
 def air_of(config: DataCenterConfig) -> tuple[float, float, float]:
     """rho cp of a site's air at 20 C, and its density at 0 C and its fall per K over that at 20 C.
 
@@ -80,7 +83,7 @@ def air_of(config: DataCenterConfig) -> tuple[float, float, float]:
     hall = config.hall
     if hall.air_density_kg_m3 is not None:
         return hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k, 1.0, 0.0
-    pressure = site_pressure_pa(config.site.location, config.site.weather_file)
+    pressure = _pressure_pa(config.site.location, config.site.weather_file)
     at = {t: 293.15 / (t + 273.15) for t in (18.0, 32.0)}
     fall = (at[18.0] - at[32.0]) / 14.0
     rho = pressure / (287.05 * 293.15)
@@ -323,7 +326,7 @@ def _supply_shares(config: DataCenterConfig) -> F64:
     return np.asarray(out / out.sum(axis=1, keepdims=True))
 
 
-@lru_cache(maxsize=128)
+@functools.lru_cache(maxsize=128)
 def calibrated(config: DataCenterConfig) -> HallTwin:
     """A hall at its design point, which tests of both precisions share."""
     return calibrated_to(config)
@@ -405,7 +408,9 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
             inlet_c = supply_c + approach_k[rack] * height
             flow = full_airflow(inlet_c, approach_k) * twin.servers(inlet_c, load, on, on)[2]
             mean = twin.per_rack(flow * raw_height) / twin.per_rack(flow)
-            height = raw_height / mean[rack]
+            before, height = height, raw_height / mean[rack]
+            if np.array_equal(height, before):
+                break
         inlet_c = supply_c + approach_k[rack] * height
         cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
         full_m3s = full_airflow(inlet_c, approach_k)
