@@ -427,14 +427,14 @@ def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
             sim.step()
             sim.servers()
 
-    for i in range(20):
+    for i in range(12):
         cycle(i)
     gc.collect()
     before = resident_mb()
-    for i in range(150):
+    for i in range(60):
         cycle(i)
     gc.collect()
-    assert resident_mb() - before < 10.0
+    assert resident_mb() - before < 5.0
 
 
 # --- inputs -------------------------------------------------------------------------------------
