@@ -19,7 +19,7 @@ from sdc_taichi.hall.design_point import design_point, odd_airflow
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import DENSE_RACKS, MixWeights
-from sdc_taichi.hall.rack_servers import RackServers, rack_servers
+from sdc_taichi.hall.rack_servers import RackServers, air_properties, rack_servers
 from sdc_taichi.hall.recirculation import Recirculation, calibrate
 from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
@@ -350,10 +350,33 @@ def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
             range_c = setpoint.min_c, setpoint.max_c
             key = config.hall, config.servers, config.hvac.crac, range_c, place
             if key not in cache:
-                cache[key] = _hall_arrays(config)
+                cache[key] = _remembered_arrays(config)
             by_ids[ids] = cache[key]
         halls.append(by_ids[ids])
     return halls
+
+
+_REMEMBERED: dict[Any, _HallArrays] = {}
+"""Arrays of recently built halls of up to ``DENSE_RACKS`` racks, oldest first."""
+_MOST_REMEMBERED = 64
+
+
+def _remembered_arrays(config: DataCenterConfig) -> _HallArrays:
+    """Return the arrays of a hall, which a process keeps for the next fleet if they are small.
+
+    The calibration of a small hall takes longer than the rest of a simulator's construction.
+    """
+    hall, crac, setpoint = config.hall, config.hvac.crac, config.hvac.setpoint
+    # A file may change between two fleets.
+    if hall.racks > DENSE_RACKS or hall.recirculation.matrix_file is not None:
+        return _hall_arrays(config)
+    air = air_properties(config)
+    key = hall, config.servers, crac, setpoint.min_c, setpoint.max_c, air
+    arrays = _REMEMBERED.pop(key, None) or _hall_arrays(config)
+    _REMEMBERED[key] = arrays
+    while len(_REMEMBERED) > _MOST_REMEMBERED:
+        _REMEMBERED.pop(next(iter(_REMEMBERED)), None)
+    return arrays
 
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
