@@ -22,6 +22,7 @@ MONTH_OF_STEP = np.repeat(
 
 
 def main(preset: str) -> None:
+    """Print the table of a preset."""
     base = load_config(preset, ["site.start=01-01"])
     limits = base.hvac.setpoint
     setpoints = np.arange(np.ceil(limits.min_c), np.floor(limits.max_c) + 1)
@@ -41,7 +42,7 @@ def main(preset: str) -> None:
             water_l[month] += result.water_l.reshape(shape[1:])
     best = setpoints[all_kwh.argmin(axis=2)]
     initial = int(np.flatnonzero(setpoints == limits.initial_c)[0])
-    print(f"| site | energy (MWh) | PUE | water (m3) | WUE (l/kWh) | best setpoint by month, {preset} |")
+    print("| site | energy (MWh) | PUE | water (m3) | WUE (l/kWh) | best setpoint by month (C) |")
     print("|---|---|---|---|---|---|")
     for i, site in enumerate(SITES):
         it, energy, water = (x[:, i, initial].sum() for x in (it_kwh, all_kwh, water_l))
