@@ -77,6 +77,8 @@ from .sums import (
     sum_chunk,
 )
 from .units import (
+    blow_out_casings,
+    change_of_air,
     extrapolate_units,
     follow_hottest_inlet,
     keep_supply,
@@ -260,6 +262,7 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     air.units_flow_m3s = units.flow_m3s
     air.supply_c = units.supply_m3k_s / units.flow_m3s
     air.units_return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
+    dc.return_c = air.units_return_c
     dc.crac_m3s_per_rack = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
     # Each mix moves by the midpoint of the exhausts' changes, plus or minus half their spread.
@@ -276,6 +279,11 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
         if is_last:
             dc.status = DONE
         air.units_load_w, air.coil_w = run_coils(hall, n, units, air.units_return_c)
+        air.casings_w = units.casings_w
+        most_k = change_of_air(hall, n, total.least_change_k, total.most_change_k)
+        if sweep > 0:
+            most_k = ti.max(most_k, dc.most_change_k)
+        dc.most_change_k = most_k
     else:
         if dc.adjusts_supply > 0.0:
             load_w = air.units_return_c * units.flow_m3s - units.supply_m3k_s
@@ -315,6 +323,8 @@ def store_air(hall: ti.template(), n, is_first, air: ti.template()):
     dc.units_return_c = running_mean(hall, is_first, dc.units_return_c, air.units_return_c)
     dc.units_load_w = running_mean(hall, is_first, dc.units_load_w, air.units_load_w)
     dc.coil_w = running_mean(hall, is_first, dc.coil_w, air.coil_w)
+    casings_w = dc.thermal_storage_w
+    dc.thermal_storage_w = running_mean(hall, is_first, casings_w, air.casings_w)
 
 
 @ti.func
@@ -322,7 +332,8 @@ def store_air(hall: ti.template(), n, is_first, air: ti.template()):
 def store_results(hall: ti.template(), n):
     """Store sums and means over the racks of a data center in DC_OUT at the end of its step.
 
-    ``store_air`` must run first: it leaves airflow times supply air in ``inlet_m3k_s``.
+    ``store_air`` must run first: it leaves airflow times supply air in ``inlet_m3k_s``, and the
+    heat that warms the air in the casings of CRAC units in ``thermal_storage_w``.
     """
     dc, first = hall.dcs[n], hall.dcs[n].first_chunk
     total, n_racks = hall.chunks[first], ti.cast(dc.racks, ti.f64)
@@ -336,7 +347,7 @@ def store_results(hall: ti.template(), n):
     dc.outlet_m3k_s = total.outlet_m3k_s * hall.weight - supplied_m3k_s
     dc.over_27_sum_k = total.over_27_sum_k * hall.weight
     dc.under_18_sum_k = total.under_18_sum_k * hall.weight
-    dc.thermal_storage_w = total.thermal_storage_w * hall.weight
+    dc.thermal_storage_w = dc.thermal_storage_w + total.thermal_storage_w * hall.weight
     block_at = ti.cast(total.hottest_block, ti.i32)
     group = ti.cast(total.hottest_group, ti.i32)
     lane = ti.cast(total.hottest_lane, ti.i32)
@@ -362,6 +373,7 @@ def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hotte
         units_return_c=none,
         units_load_w=none,
         coil_w=none,
+        casings_w=none,
     )
     is_done = True
     if ti.static(hall.recirculates):
@@ -404,6 +416,8 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
     hottest = no_hottest(hall)
     while sweeps_left > 0 and dc.status == RUNNING:
         sweep = describe_sweep(hall, n, slice_at, exchanges_after, reference_c)
+        if ti.static(hall.transient and hall.recirculates):
+            blow_out_casings(hall, n)
         for chunk_at in range(first_chunk, end_chunk):
             compute_chunk(
                 hall,

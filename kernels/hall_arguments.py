@@ -161,6 +161,9 @@ DC_DOUBLES = {
     "shift_k": "common shift of the mixes since the last exchange, K (sparse or transient)",
     "last_change_k": "midpoint of exhaust changes since the exchange, one sweep ago, K",
     "last_shift_k": "change of shift_k in the last sweep, K",
+    "return_c": "return air of the last sweep, C",
+    "most_change_k": "largest change of the air in a substep so far, see change_of_air, K "
+    "(transient)",
 }
 UNIT_INPUTS = {
     "setpoint_c": "supply setpoint, in steady air including the warmth of the room, C",
@@ -169,6 +172,7 @@ UNIT_INPUTS = {
     "design_m3s": "airflow at full speed, m3/s",
     "running": "1 if the unit runs, 0 if it coasts without cooling",
     "capacity_w": "maximum heat that the coil removes, W",
+    "casing_m3": "air in coil and casing, m3 (transient)",
 }
 UNIT_STATE = {
     "supply_c": "supply air, C",
@@ -179,7 +183,12 @@ UNIT_STATE = {
     "need_m3s": "supply air that the racks demand, m3/s",
     "following": "fan speed / full speed that would just cover the need",
     "speed": "fan speed / full speed in the present sweep",
-    "excess_k": "next sweep's supply air minus setpoint and warmth of the room, K",
+    "excess_k": "next sweep's air behind the coil, if the unit runs, minus setpoint and warmth of "
+    "the room, K",
+    "coil_c": "next sweep's air behind the coil, C (transient)",
+    "coil_change_k": "change of coil_c after the substep, K (transient)",
+    "casing_c": "air in the casing at the start of the substep, C (transient)",
+    "casing_change_k": "change of casing_c in the substep, K (transient)",
     "mean_supply_c": "supply air, in transient halls the mean of the substeps so far, C",
     "last_f_change": "change of fresh_ratio in the sweep before (steady air)",
     "last_supply_change_k": "change of supply air in the sweep before, K (steady air)",

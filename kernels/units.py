@@ -4,6 +4,7 @@ from typing import no_type_check
 
 import taichi as ti
 
+from .decay import halvings_for, phi1, power_of_half
 from .hall_arguments import N_BLOCK_TERMS
 from .servers import first_share_at
 from .sums import sum_lanes
@@ -18,6 +19,11 @@ period in sweeps; the sweeps between show the factor by which changes shrink."""
 SLOW_FACTOR, MOST_EXTRAPOLATED = 0.3, 100.0
 """Factor of successive changes from which the units are extrapolated, and largest multiple of the
 present change that is added."""
+COIL_PART, CASING_PART = 4.0, 0.25
+"""Factors by which changes of the air behind a coil, at full speed, and in a casing count as
+changes of the air of the hall."""
+SHORT_OF_AIR = 20.0
+"""Factor by which changes of the air count more where units do not cover the need of the racks."""
 COVERED_WITHIN = 1e-6
 """Share of their need that units may seem to lack although they cover it. At the design point units
 deliver just what racks need."""
@@ -56,6 +62,52 @@ def unit_need(hall: ti.template(), n, unit):
 
 @ti.func
 @no_type_check
+def blow_out_casings(hall: ti.template(), n):
+    """Set the supply air of each unit to the mean air that leaves its casing during a substep.
+
+    Air behind the coil, at temperature T_coil, replaces the well-mixed air in the casing:
+    V_casing dT/dt = V_k (T_coil - T). With x = V_k t / V_casing, the exact mean of a substep is
+    T_coil + (T(0) - T_coil) (1 - exp(-x)) / x. ``V_k`` is the airflow of the substep before.
+    """
+    at = hall.dcs[n].first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        flow_m3s = ti.cast(unit.design_m3s, ti.f64) * unit.speed
+        x = ti.cast(flow_m3s * hall.substep_s, hall.real) / unit.casing_m3
+        halvings = halvings_for(hall, x)
+        part = power_of_half(hall, halvings)
+        phi = phi1(hall, x * part, halvings) * part
+        over_coil_k = unit.casing_c - unit.coil_c
+        unit.supply_c = unit.coil_c + over_coil_k * ti.cast(phi, ti.f64)
+        unit.casing_change_k = -over_coil_k * ti.cast(x * phi, ti.f64)
+        at += hall.one
+
+
+@ti.func
+@no_type_check
+def change_of_air(hall: ti.template(), n, least_exhaust_k, most_exhaust_k):
+    """Return a measure of how much the air of a data center changes in a substep, in K.
+
+    It is the largest change of an exhaust, ``COIL_PART`` times that of the air behind a coil, or
+    ``CASING_PART`` times that in a casing, which shows that a unit has stopped or started. The
+    error of a substep grows with it, because exhausts and coils act on the racks one substep later.
+    Where units do not cover the need of the racks, warmer servers draw more exhaust, and errors add
+    up: there the change counts ``SHORT_OF_AIR`` times.
+    """
+    most_k, at = ti.max(ti.abs(least_exhaust_k), ti.abs(most_exhaust_k)), hall.dcs[n].first_unit
+    factor = ti.cast(1.0, ti.f64)
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        most_k = ti.max(most_k, CASING_PART * ti.abs(unit.casing_change_k))
+        most_k = ti.max(most_k, COIL_PART * unit.speed * ti.abs(unit.coil_change_k))
+        if unit.fresh_ratio < 1.0 - COVERED_WITHIN:
+            factor = SHORT_OF_AIR
+        at += hall.one
+    return factor * most_k
+
+
+@ti.func
+@no_type_check
 def run_crac_units(hall: ti.template(), n, is_last):
     """Set the airflow of the CRAC units to the need of the racks, and the share of it they cover.
 
@@ -74,7 +126,11 @@ def run_crac_units(hall: ti.template(), n, is_last):
         running_m3s=none,
         running_m3k_s=none,
         any_running=none,
+        # Heat that warms the air in casings, of all units and of running units.
+        casings_w=none,
+        running_casings_w=none,
     )
+    air = ti.cast(dc.air_j_per_m3_k, ti.f64)
     fresh_share = ti.cast(dc.fresh_share, ti.f64)
     at = dc.first_unit
     while at < hall.dcs[n + 1].first_unit:
@@ -103,6 +159,10 @@ def run_crac_units(hall: ti.template(), n, is_last):
         if is_running > 0.0:
             units.any_running = ti.cast(1.0, ti.f64)
         if ti.static(hall.transient):
+            casing_w = air * ti.cast(unit.casing_m3, ti.f64) * unit.casing_change_k / hall.substep_s
+            units.casings_w += casing_w
+            units.running_casings_w += is_running * casing_w
+            unit.casing_c = unit.casing_c + unit.casing_change_k
             flow *= hall.weight
             cubed *= hall.weight
             mean_supply_c *= hall.weight
@@ -203,7 +263,8 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
     b_k = setpoint + gain max(0, rise at design - rise). A coil that would have to remove more than
     its capacity C_k supplies warmer air, theta - C_k / (rho cp V_k). A unit that is down supplies
     theta, the return air. If the capacity of all coils together is too small, all fall short by the
-    same share, and the room stores the remaining heat.
+    same share, and the room stores the remaining heat. In transient halls, all this is the air
+    behind the coils; the casings follow, see ``blow_out_casings``.
 
     Args:
         hall: arguments of the hall kernel.
@@ -239,7 +300,14 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
             else:
                 supply_c = theta
         most_change_k = ti.max(most_change_k, ti.abs(supply_c - unit.supply_c))
-        unit.excess_k = supply_c - setpoint_c - warmed_k
+        excess_k = supply_c - setpoint_c - warmed_k
+        if ti.static(hall.transient):
+            # A unit that is down would supply such air as soon as it runs again.
+            if units.any_running > 0.0 and unit.running <= hall.real(0.0):
+                excess_k = base_k - warmed_k
+            unit.coil_change_k = supply_c - unit.coil_c
+            unit.coil_c = supply_c
+        unit.excess_k = excess_k
         unit.supply_c = supply_c
         at += hall.one
     return most_change_k
@@ -250,14 +318,16 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
 def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
     """Return the heat that reaches the coils in a substep, and the heat that they remove, in W.
 
-    Coils remove the heat that brings supply air back to its setpoint, up to the limit of the plant.
-    The room stores the rest, which warms the supply air of the next substep.
+    The heat that warms the air in the casings does not reach the coils. Coils remove the heat that
+    brings supply air back to its setpoint, up to the limit of the plant. The room stores the rest,
+    which warms the supply air of the next substep.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
     fans_w = units.fan_m3s * dc.crac_fan_w_per_m3s
-    load_w = air * (return_c * units.flow_m3s - units.supply_m3k_s) + fans_w
+    load_w = air * (return_c * units.flow_m3s - units.supply_m3k_s) + fans_w - units.casings_w
     running_w = air * (return_c * units.running_m3s - units.running_m3k_s) + fans_w
+    running_w -= units.running_casings_w
     wanted_w = ti.max(running_w + units.any_running * dc.room_j / hall.substep_s, 0.0)
     coil_w = ti.min(wanted_w, dc.coil_limit_w)
     room_j = dc.room_j + (load_w - coil_w) * hall.substep_s
@@ -269,8 +339,11 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
         at = dc.first_unit
         while at < hall.dcs[n + 1].first_unit:
             unit = hall.units[at]
+            coil_c = ti.cast(unit.setpoint_c, ti.f64) + warmed_k
             unit.excess_k = 0.0
-            unit.supply_c = ti.cast(unit.setpoint_c, ti.f64) + warmed_k
+            unit.coil_change_k = coil_c - unit.coil_c
+            unit.coil_c = coil_c
+            unit.supply_c = coil_c
             at += hall.one
     return load_w, coil_w
 

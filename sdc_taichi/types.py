@@ -169,14 +169,20 @@ class State:
     captured_m3s: Reals
     """Recirculated air that each rack draws in, in m3/s, (R,); only in transient halls."""
     need_m3s: F64
-    """Supply airflow that the racks demand from each CRAC unit, in m3/s, (U,); only in transient
-    halls."""
-    following: F64
-    """Fan speed at which each CRAC unit would just meet ``need_m3s``, as a share of full speed,
+    """Supply airflow that the racks would demand from each CRAC unit if all units ran, in m3/s,
     (U,); only in transient halls."""
+    following: F64
+    """Speed of fans that follow the hottest inlet, otherwise the speed at which each CRAC unit
+    would just meet the demand of the racks, as a share of full speed, (U,); only in transient
+    halls."""
     supply_excess_k: F64
-    """Supply temperature of each CRAC unit minus its setpoint and minus the warming of the room by
-    stored heat, in K, (U,); only in transient halls."""
+    """Temperature behind the coil of each CRAC unit, if the unit runs, minus its setpoint and minus
+    the warming of the room by stored heat, in K, (U,); only in transient halls."""
+    casing_c: F64
+    """Temperature of the air in the casing of each CRAC unit, in C, (U,); only in transient
+    halls."""
+    return_air_c: F64
+    """Temperature of the return air of the CRAC units, in C, (B,); only in transient halls."""
 
 
 DATA_CENTERS, CRAC_UNITS, RACKS = "B", "U", "R"

@@ -711,12 +711,16 @@ class Memory:
     """What each rack gives to the mixes: its outlet and, for air it does not move, its own mix."""
     captured_m3s: F64
     need_m3s: F64
-    """Supply air that the racks ask of each unit, (U,)."""
+    """Supply air that the racks would ask of each unit if all units ran, (U,)."""
     following: F64
-    """Fan speed of each unit that would just cover that need, over full speed, (U,)."""
+    """Fan speed of each unit that would just cover their need, over full speed, (U,)."""
     room_j: float
     excess_k: F64
-    """Supply air of each unit over its setpoint and the warmth of the room, (U,)."""
+    """Air behind each coil over its setpoint and the warmth of the room, if the unit runs, (U,)."""
+    casing_c: F64
+    """Air in the casing of each unit, (U,)."""
+    return_c: float
+    """Air that comes back to the units."""
 
 
 def advance(
@@ -739,9 +743,18 @@ def advance(
     """Means over a step and the memory at its end; arguments as in ``steady``."""
     h, air, s = step_s / substeps, hall.air_j_per_m3_k, hall.config.servers
     capacity = heat_capacity_j_per_k(hall)
-    now, parts = memory, []
+    whole, casing_m3 = calibrated(hall.config), 0.3 * hall.unit_design_m3s
+    drawn, of_whole = hall.need_m3s @ hall.unit_shares, hall.need_m3s @ whole.unit_shares
+    drawn = np.where(drawn * of_whole > 0, drawn / np.where(of_whole > 0, of_whole, 1.0), 1.0)
+    need = memory.need_m3s * drawn
+    now, parts = replace(memory, need_m3s=need, following=wanted_speed(hall, need)), []
     for _ in range(substeps):
-        supply_c = setpoint_c + now.room_j / room_j_per_k + now.excess_k
+        coil_c = setpoint_c + now.room_j / room_j_per_k + now.excess_k
+        coil_c = supply_by_unit(coil_c, running, now.return_c)
+        emptied = hall.unit_design_m3s * np.clip(now.following, low, high) * h / casing_m3
+        supply_c = coil_c - (now.casing_c - coil_c) * np.expm1(-emptied) / emptied
+        casing_c = coil_c + (now.casing_c - coil_c) * np.exp(-emptied)
+        casings_w = air * casing_m3 * (casing_c - now.casing_c) / h
         target = hall.weights @ now.given_c
         # A still parcel is stirred by its part of the CRAC air.
         units_m3s = hall.unit_design_m3s * np.clip(now.following, low, high)
@@ -785,7 +798,7 @@ def advance(
         given_c = np.where(powered > 0, outlet_c, passed_c)
         warm = rack_flow @ outlet_c - captured @ mixed - parcel_w / air
         return_c = float((warm + moved.bypass @ supply_c) / moved.unit.sum())
-        taken = air * moved.unit * (return_c - supply_c)
+        taken = air * moved.unit * (return_c - supply_c) - casings_w
         drawn = running * moved.speed**3 * fan_w_per_m3s * hall.unit_design_m3s
         load_w = float(np.sum(taken + drawn))
         warmth = moved.unit @ supply_c / moved.unit.sum()
@@ -800,7 +813,8 @@ def advance(
                 "over_27_sum_k": np.maximum(inlet_c - 27, 0).sum(),
                 "under_18_sum_k": np.maximum(18 - inlet_c, 0).sum(),
                 "outlet_m3k_s": carried.sum() - rack_flow.sum() * warmth,
-                "thermal_storage_w": np.sum(capacity * (warmer - now.server_c)) / h + parcel_w,
+                "thermal_storage_w": np.sum(capacity * (warmer - now.server_c)) / h
+                + parcel_w + casings_w.sum(),
                 "units_flow_m3s": moved.unit.sum(),
                 "supply_c": warmth, "units_return_c": return_c,
                 "units_load_w": load_w, "coil_w": coil_w,
@@ -813,14 +827,13 @@ def advance(
             }
         )  # fmt: skip
         room_j = now.room_j + (load_w - coil_w) * h
-        base_c = setpoint_c + room_j / room_j_per_k
         now = Memory(
             warmer, mixed_end, mixed + breath * (given_c - mixed), captured, moved.need,
             wanted_speed(hall, moved.need),
-            room_j, supply_by_unit(base_c, running, return_c) - base_c,
+            room_j, np.zeros(len(setpoint_c)), casing_c, return_c,
         )  # fmt: skip
     found: dict[str, Any] = {}
     for name in parts[0]:
         values = np.array([p[name] for p in parts])
         found[name] = values.max(axis=0) if name.endswith("_max_c") else sum(values) / substeps
-    return found, now
+    return found, replace(now, need_m3s=now.need_m3s / drawn)

@@ -147,7 +147,7 @@ def test_fan_speed_is_a_control_of_its_own() -> None:
 # --- protection ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 12.0), ("transient", 6.0)])
+@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 12.0), ("transient", 8.0)])
 def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
     thermal: str, margin_k: float
 ) -> None:

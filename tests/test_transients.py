@@ -70,10 +70,14 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
         need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
         following=rng.uniform(0.2, 1.1, fleet.units),
         supply_excess_k=rng.uniform(0.0, 3.0, fleet.units),
+        casing_c=rng.uniform(16, 40, fleet.units),
+        return_air_c=rng.uniform(25, 40, fleet.size),
     )
 
 
-def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> reference_twin.Memory:
+def twin_memory(
+    fleet: Fleet, part: Part, state: HallState, room_j: float, dc: int
+) -> reference_twin.Memory:
     assert fleet.air is not None
     counts = np.diff(fleet.server_offsets)[part.groups]
     return reference_twin.Memory(
@@ -87,6 +91,8 @@ def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> re
         following=state.following[part.units],
         room_j=room_j,
         excess_k=state.supply_excess_k[part.units],
+        casing_c=state.casing_c[part.units],
+        return_c=float(state.return_air_c[dc]),
     )
 
 
@@ -106,7 +112,7 @@ def test_transient_halls_agree_with_the_twin(
     for i, part in enumerate(parts(configs, met)):
         found, left = reference_twin.advance(
             part.twin,
-            twin_memory(fleet, part, before, coil.room_j[i]),
+            twin_memory(fleet, part, before, coil.room_j[i], i),
             part.supply_c,
             part.load,
             low=part.low,
@@ -120,7 +126,7 @@ def test_transient_halls_agree_with_the_twin(
             step_s=900.0,
             substeps=substeps,
         )
-        own = twin_memory(fleet, part, after, sums.room_j[i])
+        own = twin_memory(fleet, part, after, sums.room_j[i], i)
         # Heat that flows in and out counts against what passes through.
         through = float(np.sum(found["outlet_m3k_s"])) * part.twin.air_j_per_m3_k
         through += coil.room_j[i] / 900.0
@@ -262,7 +268,8 @@ def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
     servers = np.add.reduceat(per_group, fleet.group_offsets[fleet.rack_offsets[:-1]])
     parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_offsets[:-1])
     per_parcel = np.array([t.parcel_j_per_k for t in twins])
-    return np.asarray(servers + parcels * per_parcel + room_j, dtype=np.float64)
+    casings = fleet.unit_sums(0.3 * fleet.unit_design_m3s * state.casing_c) * air_j_per_m3_k(fleet)
+    return np.asarray(servers + parcels * per_parcel + casings + room_j, dtype=np.float64)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -346,6 +353,7 @@ def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: P
         means.append((sums.inlet_mean_c[0], sums.outlet_mean_c[0], sums.supply_c[0]))
     parcels = reference_twin.calibrated(config).parcel_j_per_k * fleet.racks
     capacity = servers * (1e3 * config.server_heat_capacity_kj_per_k + 2000.0) + parcels
+    capacity = capacity + 0.3 * fleet.unit_design_m3s.sum() * air_j_per_m3_k(fleet)
     expected = 900.0 * (sums.cpu_w + sums.it_fan_w) / capacity
     rel = {"f64": 1e-6, "f32": 1e-3}[precision]
     np.testing.assert_allclose(np.diff(means, axis=0)[-1], np.full(3, expected[0]), rtol=rel)
@@ -484,12 +492,13 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     coil = random_coil(rng, fleet, met.unit_supply_c)
     batch = Hall(fleet, precision)
     settled = batch.steady_state(replace(met, powered=None))
-    together, after = batch.advance(met, settled, coil, 900.0, 60.0)
+    together, after = batch.advance(met, settled, coil, 900.0, 60.0, shortest_s=5.0)
     layers = batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(fleet_of(config), precision)
-        of_units = "need_m3s", "following", "supply_excess_k"
-        where = {"server_c": part.groups} | dict.fromkeys(of_units, part.units)
+        of_units = "need_m3s", "following", "supply_excess_k", "casing_c"
+        where = {"server_c": part.groups, "return_air_c": slice(i, i + 1)}
+        where |= dict.fromkeys(of_units, part.units)
         own = own_conditions(met, configs, i)
         start = alone.steady_state(replace(own, powered=None))
         one = slice(i, i + 1)
@@ -502,6 +511,7 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
             ),
             900.0,
             60.0,
+            shortest_s=5.0,
         )  # fmt: skip
         for state, other in ((start, settled), (end, after)):
             for f in fields(state):

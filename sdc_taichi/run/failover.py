@@ -24,6 +24,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.run.metrics import finite_or_none
+from sdc_taichi.sim.air import SHORTEST_SUBSTEP_S
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
@@ -34,8 +35,6 @@ Lost = Literal["units", "plant"]
 
 MINUTES = 60
 """Length of a study, in one-minute steps."""
-SUBSTEP_S = 5.0
-"""Maximum length of a substep, in s; the air before a rack follows its mix within about 20 s."""
 MOST_UNITS_PAIRED = 12
 """Maximum number of CRAC units for which every pair is studied; with more units, each unit is
 paired only with its nearest neighbour."""
@@ -241,7 +240,7 @@ def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
     values = {
         "simulation.thermal": "transient",
         "simulation.steps_per_hour": 60,
-        "simulation.substep_s": SUBSTEP_S,
+        "simulation.substep_s": SHORTEST_SUBSTEP_S,
         "hvac.setpoint.initial_c": setpoint_c,
         "hvac.setpoint.schedule_c": None,
         "protection.ashrae_class": config.protection.ashrae_class or CLASS,

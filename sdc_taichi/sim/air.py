@@ -22,16 +22,19 @@ from sdc_taichi.sim.work_allocation import Placement
 from sdc_taichi.types import F64, State, fields_of
 
 J_PER_KWH = 3.6e6
+SHORTEST_SUBSTEP_S = 5.0
+"""Length of the shortest substeps after abrupt changes, in s; the air before a rack follows its mix
+within about 20 s."""
 _AXES = {"unit": "U", "rack": "R"}
 """Axes of the fields of ``HallSums`` by the first part of their names; all other fields have one
 entry per data center, B."""
 STATE_AXES = {
-    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh"), "B"),
+    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh", "return_air_c"), "B"),
     **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
     **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),
     **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
     **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
-    **dict.fromkeys(("need_m3s", "following", "supply_excess_k"), "U"),
+    **dict.fromkeys(("need_m3s", "following", "supply_excess_k", "casing_c"), "U"),
 }
 """First axes of the fields of ``State``, except its seeds and its clock."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))
@@ -151,6 +154,7 @@ class TransientAir:
             coil,
             self._step_s,
             self._substep_s,
+            shortest_s=SHORTEST_SUBSTEP_S,
         )
         return air, {**fields_of(after), "group_inlet_c": self._inlets.last()}
 

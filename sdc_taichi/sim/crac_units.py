@@ -285,6 +285,9 @@ class SharedPlenum:
         adjusts_supply[:] = self._always_adjusts
         self.weight = np.ones(fleet.units)
         """Weight of each CRAC unit in the shares of all racks, (U,); 1 while all units run."""
+        self.drawn_ratio = np.ones(fleet.units)
+        """Supply air that the racks draw from each unit at the design point, divided by what they
+        draw while all units run, (U,); 1 for units from which they draw none."""
         self._whole = np.ones(fleet.units)
         self._running = self._whole
         self._weights_of_set: dict[tuple[int, bytes], F64] = {}
@@ -317,10 +320,17 @@ class SharedPlenum:
             if len(self._weights_of_set) == _MOST_STORED:
                 self._weights_of_set.clear()
             self._weights_of_set[key] = self._weights(dc, shares, runs)
-        self.weight[units] = self._weights_of_set[key]
+        self.weight[units] = weight = self._weights_of_set[key]
         some_down = bool(np.any(runs > 0) and np.any(runs == 0))
         self._adjusts_supply[dc] = some_down or self._always_adjusts[dc]
-        by_block = shares_by_block(weighted_shares(shares, self._weights_of_set[key]), self._lanes)
+        weighted = weighted_shares(shares, weight)
+        need_m3s = fleet.air.rack_need_m3s[slice(*fleet.rack_offsets[dc : dc + 2])]
+        drawn_m3s, of_all_m3s = need_m3s @ weighted, need_m3s @ shares
+        is_drawn = (drawn_m3s > 0) & (of_all_m3s > 0)
+        self.drawn_ratio[units] = np.where(is_drawn, drawn_m3s, 1.0) / np.where(
+            is_drawn, of_all_m3s, 1.0
+        )
+        by_block = shares_by_block(weighted, self._lanes)
         first = int(self._first_share[dc])
         self._kernel_shares[first : first + len(by_block)] = by_block
 

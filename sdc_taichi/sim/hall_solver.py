@@ -65,13 +65,18 @@ class HallState:
     captured_m3s: Reals
     """Recirculated air that each rack draws in, in m3/s, (R,)."""
     need_m3s: F64
-    """Supply airflow that the racks demand from each CRAC unit, in m3/s, (U,)."""
-    following: F64
-    """Fan speed at which each CRAC unit would just meet ``need_m3s``, as a share of full speed,
+    """Supply airflow that the racks would demand from each CRAC unit if all units ran, in m3/s,
     (U,)."""
+    following: F64
+    """Speed of fans that follow the hottest inlet, otherwise the speed at which each CRAC unit
+    would just meet the demand of the racks, as a share of full speed, (U,)."""
     supply_excess_k: F64
-    """Supply temperature of each CRAC unit minus its setpoint and minus the warming of the room by
-    stored heat, in K, (U,)."""
+    """Temperature behind the coil of each CRAC unit, if the unit runs, minus its setpoint and minus
+    the warming of the room by stored heat, in K, (U,)."""
+    casing_c: F64
+    """Temperature of the air in the casing of each CRAC unit, in C, (U,)."""
+    return_air_c: F64
+    """Temperature of the return air of the CRAC units, in C, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +104,8 @@ SLICES_PER_THREAD = 8
 """Number of work slices per thread; several slices balance the load of the threads."""
 TOLERANCE_K: dict[Precision, float] = {"f32": 2e-4, "f64": 1e-12}
 """Convergence tolerance in K: change of the exhaust mix before any rack by a further sweep."""
+MOST_CHANGE_K = 0.5
+"""Change of the air in a substep, in K, above which a step is repeated with shorter substeps."""
 SAMPLE_TOLERANCE_K: dict[Precision, float] = {"f32": 5e-5, "f64": 1e-8}
 """Convergence tolerance of sampled racks in K, small enough that large halls rarely need a second
 sweep for it."""
@@ -287,9 +294,20 @@ class Hall:
         return self._results(dc_out, transient=False)
 
     def advance(
-        self, conditions: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
+        self,
+        conditions: Conditions,
+        state: HallState,
+        coil: Coil,
+        step_s: float,
+        substep_s: float,
+        *,
+        shortest_s: float | None = None,
     ) -> tuple[HallSums, HallState]:
         """Advance transient halls by one step, in equal substeps of at most ``substep_s``.
+
+        Exhausts act on the racks one substep later, so abrupt changes need short substeps. A data
+        center whose air changes by more than ``MOST_CHANGE_K`` in a substep (``change_of_air`` of
+        the kernels) repeats the step with substeps that are shorter by this ratio.
 
         Args:
             conditions: Load and failures; the supply temperature follows from ``coil``.
@@ -297,28 +315,42 @@ class Hall:
             coil: Setpoints, heat stored in the room, and the limit of the plant.
             step_s: Length of the step, in s.
             substep_s: Maximum length of a substep, in s.
+            shortest_s: Length down to which substeps of repeated steps are shortened, in s; None
+                repeats no step.
 
         Returns:
             Means over the step, and the thermal state at its end.
         """
         self._set_conditions(conditions)
-        self._set_state(state)
-        self._set_coil(coil, state.supply_excess_k)
-        substeps = int(np.ceil(step_s / substep_s - 1e-9))
         dc_out = self._new_results()
         self.beyond_limits = None
-        self._begin_step(exchanges_before=1)
         before = np.ascontiguousarray(state.server_c, self._dtype)
         after = np.empty(self._fleet.groups, self._dtype)
-        self._run_sweeps(
-            dc_out,
-            substeps,
-            transient=True,
-            substep_s=step_s / substeps,
-            weight=1.0 / substeps,
-            server_c_before=before,
-            server_c_after=after,
-        )
+
+        def advance(chosen: npt.NDArray[np.bool_], substeps: int) -> None:
+            self._set_state(state, coil, chosen)
+            self._begin_step(exchanges_before=1, chosen=chosen)
+            self._run_sweeps(
+                dc_out,
+                substeps,
+                transient=True,
+                substep_s=step_s / substeps,
+                weight=1.0 / substeps,
+                server_c_before=before,
+                server_c_after=after,
+            )
+
+        def count(length_s: float) -> int:
+            return int(np.ceil(step_s / length_s - 1e-9))
+
+        substeps = count(substep_s)
+        advance(np.ones(self._fleet.size, np.bool_), substeps)
+        if shortest_s is not None:
+            ratio = np.ceil(self._dc["most_change_k"] / MOST_CHANGE_K)
+            # Halls whose temperatures are not numbers are beyond all limits.
+            needed = np.nan_to_num(np.minimum(substeps * ratio, count(shortest_s)))
+            for finer in np.unique(needed[needed > substeps]).tolist():
+                advance(needed == finer, int(finer))
         return self._results(dc_out, transient=True), self._hall_state(after)
 
     def steady_state(self, conditions: Conditions) -> HallState:
@@ -329,8 +361,10 @@ class Hall:
         server_c = np.zeros(self._fleet.groups, self._dtype)
         # One very long substep brings the servers to their steady temperatures. It also changes
         # the air, which is already steady and is therefore restored afterwards.
-        air = [self._memory["mixed_c"]]
+        air = [self._memory["mixed_c"], self._dc["return_c"]]
         air += [self._unit_state[name] for name in ("fresh_ratio", "supply_c", "excess_k")]
+        for name in ("coil_c", "casing_c"):
+            self._unit_state[name][:] = self._unit_state["supply_c"]
         steady = [row.copy() for row in air]
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin_step(exchanges_before=1)
@@ -344,6 +378,7 @@ class Hall:
         )
         for row, values in zip(air, steady, strict=True):
             row[:] = values
+        self._unit_state["casing_c"][:] = self._unit_state["supply_c"]
         self.discard_last_step()
         state = self._hall_state(server_c)
         return state if self.beyond_limits is None else self._at_supply(state, conditions)
@@ -366,6 +401,8 @@ class Hall:
             "need_m3s": (units, fleet.unit_design_m3s),
             "following": (units, 1.0),
             "supply_excess_k": (units, 0.0),
+            "casing_c": (units, mean_c[fleet.unit_dc]),
+            "return_air_c": (self.beyond_limits, mean_c),
         }
         return HallState(
             **{
@@ -496,30 +533,56 @@ class Hall:
         self._unit_state["supply_c"][:] = conditions.unit_supply_c
         self._unit_state["excess_k"][:] = 0.0
 
-    def _set_state(self, state: HallState) -> None:
-        """Write thermal state and CRAC airflow at the start of a transient step to the kernels."""
-        fleet = self._fleet
-        for name in ("mixed_c", "exhaust_c", "captured_m3s"):
-            self._places.put(self._memory[name], getattr(state, name))
-        speed = np.clip(state.following, self._unit["low"], self._unit["high"])
-        covers = self._fresh_m3s * speed / np.maximum(state.need_m3s, 1e-30)
-        self._unit_state["fresh_ratio"][:] = np.minimum(1.0, covers)
-        self._dc["fan_speed"][:] = state.following[fleet.unit_offsets[:-1]]
-        flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
-        self._dc["crac_m3s_per_rack"][:] = flow_m3s / np.diff(fleet.rack_offsets)
+    def _set_state(self, state: HallState, coil: Coil, chosen: npt.NDArray[np.bool_]) -> None:
+        """Write the thermal state at the start of a transient step to the kernels.
 
-    def _set_coil(self, coil: Coil, excess_k: F64) -> None:
-        """Write setpoints, room, plant limit and first supply temperature of a transient step."""
+        Args:
+            state: State of the air, and with it the airflow and supply air of the CRAC units.
+            coil: Setpoints, heat stored in the room, and limit of the plant.
+            chosen: True for the data centers to set, (B,).
+        """
+        fleet, of_unit = self._fleet, chosen[self._fleet.unit_dc]
+        for name in ("mixed_c", "exhaust_c", "captured_m3s"):
+            values = getattr(state, name)
+            if not chosen.all():
+                present = self._places.values_of_racks(self._memory[name][None])[0]
+                values = np.where(chosen[fleet.rack_dc], values, present)
+            self._places.put(self._memory[name], values)
+        # Shares, and with them the demand on each unit, change when units stop or start.
+        need_m3s = state.need_m3s * self._tables.plenum.drawn_ratio
+        follows_inlet = self._dc["inlet_target_c"][fleet.unit_dc] > 0.0
+        following = np.where(
+            follows_inlet, state.following, need_m3s / np.maximum(self._fresh_m3s, 1e-30)
+        )
+        speed = np.clip(following, self._unit["low"], self._unit["high"])
+        covers = self._fresh_m3s * speed / np.maximum(need_m3s, 1e-30)
+        warmed_k = (coil.room_j / coil.room_j_per_k)[fleet.unit_dc]
+        coil_c = coil.setpoint_c + warmed_k + state.supply_excess_k
+        running = self._unit["running"]
+        any_running = fleet.unit_sums(running)[fleet.unit_dc] > 0.0
+        passes_return_air = (running == 0.0) & any_running
+        coil_c = np.where(passes_return_air, state.return_air_c[fleet.unit_dc], coil_c)
+        of_units = {
+            "fresh_ratio": np.minimum(1.0, covers),
+            "speed": speed,
+            "coil_c": coil_c,
+            "supply_c": coil_c,
+            "casing_c": state.casing_c,
+        }
+        flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
+        of_dcs = {
+            "fan_speed": state.following[fleet.unit_offsets[:-1]],
+            "crac_m3s_per_rack": flow_m3s / np.diff(fleet.rack_offsets),
+            "room_j": coil.room_j,
+            "room_j_per_k": coil.room_j_per_k,
+            "coil_limit_w": coil.limit_w,
+            "crac_fan_w_per_m3s": coil.fan_w_per_m3s,
+        }
         self._unit["setpoint_c"][:] = coil.setpoint_c
-        for name, values in (
-            ("room_j", coil.room_j),
-            ("room_j_per_k", coil.room_j_per_k),
-            ("coil_limit_w", coil.limit_w),
-            ("crac_fan_w_per_m3s", coil.fan_w_per_m3s),
-        ):
-            self._dc[name][:] = values
-        warmed_k = (coil.room_j / coil.room_j_per_k)[self._fleet.unit_dc]
-        self._unit_state["supply_c"][:] = coil.setpoint_c + warmed_k + excess_k
+        for row, values in of_units.items():
+            np.copyto(self._unit_state[row], values, where=of_unit)
+        for row, values in of_dcs.items():
+            np.copyto(self._dc[row], values, where=chosen)
 
     def _begin_steady_step(self, conditions: Conditions) -> None:
         """Set the conditions of a step in steady air, where CRAC units first cover all need."""
@@ -528,12 +591,15 @@ class Hall:
         self._dc["fan_speed"][:] = 1.0
         self._begin_step(exchanges_before=0)
 
-    def _begin_step(self, exchanges_before: int) -> None:
+    def _begin_step(
+        self, exchanges_before: int, chosen: npt.NDArray[np.bool_] | Literal[True] = True
+    ) -> None:
         """Reset the control rows of the kernel for a new step.
 
         Args:
             exchanges_before: 1 if the first sweep starts from the stored ``exhaust_c``, 0 if it
                 looks up an initial guess.
+            chosen: True for the data centers that run the step, (B,).
         """
         first = {
             "status": RUNNING,
@@ -544,9 +610,9 @@ class Hall:
             "chunks_done": 0,
         }
         for row, value in zip(self._control.values(), in_row_order(DC_CONTROL, first), strict=True):
-            row[:] = value
+            np.copyto(row, value, where=chosen)
         for name in ("shift_k", "last_change_k", "last_shift_k"):
-            self._dc[name][:] = 0.0
+            np.copyto(self._dc[name], 0.0, where=chosen)
 
     def _add_sampled_racks(self, precision: Precision) -> None:
         """Compute the modes of all sparse halls, and the racks that they sample.
@@ -750,9 +816,11 @@ class Hall:
             mixed_c=self._places.values_of_racks(self._memory["mixed_c"][None])[0],
             exhaust_c=self._places.values_of_racks(self._exhaust()[None])[0],
             captured_m3s=self._places.values_of_racks(self._memory["captured_m3s"][None])[0],
-            need_m3s=self._unit_state["need_m3s"].copy(),
+            need_m3s=self._unit_state["need_m3s"] / self._tables.plenum.drawn_ratio,
             following=self._unit_state["following"].copy(),
             supply_excess_k=self._unit_state["excess_k"].copy(),
+            casing_c=self._unit_state["casing_c"].copy(),
+            return_air_c=self._dc["return_c"].copy(),
         )
 
     def _aligned(self, shape: tuple[int, ...]) -> Any:

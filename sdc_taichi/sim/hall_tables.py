@@ -50,6 +50,8 @@ from sdc_taichi.types import F64, I32
 
 RETURN_BAND_K = 2.0
 """Proportional band of return-air control, in K: setpoint minus return temperature without load."""
+CASING_S = 0.3
+"""Air in coil and casing of a CRAC unit divided by its airflow at full speed, in s."""
 Array = Any
 """NumPy array of any type; an array of vectors has one more axis here than in the kernel."""
 
@@ -191,6 +193,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     tables = HallTables(places, arrays, int(group_places), slices, plenum)
     tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
     tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
+    tables.rows("unit_inputs")["casing_m3"][:] = CASING_S * fleet.unit_design_m3s
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
 
