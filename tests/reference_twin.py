@@ -744,9 +744,10 @@ def advance(
     h, air, s = step_s / substeps, hall.air_j_per_m3_k, hall.config.servers
     capacity = heat_capacity_j_per_k(hall)
     whole, casing_m3 = calibrated(hall.config), 0.3 * hall.unit_design_m3s
-    drawn, of_whole = hall.need_m3s @ hall.unit_shares, hall.need_m3s @ whole.unit_shares
-    drawn = np.where(drawn * of_whole > 0, drawn / np.where(of_whole > 0, of_whole, 1.0), 1.0)
-    need = memory.need_m3s * drawn
+    of_part, of_whole = hall.need_m3s @ hall.unit_shares, hall.need_m3s @ whole.unit_shares
+    is_drawn = of_part * of_whole > 0
+    share_left = np.where(is_drawn, of_part, 1.0) / np.where(is_drawn, of_whole, 1.0)
+    need = memory.need_m3s * share_left
     now, parts = replace(memory, need_m3s=need, following=wanted_speed(hall, need)), []
     for _ in range(substeps):
         coil_c = setpoint_c + now.room_j / room_j_per_k + now.excess_k
@@ -836,4 +837,4 @@ def advance(
     for name in parts[0]:
         values = np.array([p[name] for p in parts])
         found[name] = values.max(axis=0) if name.endswith("_max_c") else sum(values) / substeps
-    return found, replace(now, need_m3s=now.need_m3s / drawn)
+    return found, replace(now, need_m3s=now.need_m3s / share_left)
