@@ -19,6 +19,7 @@ from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint, fits
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F64
 from test_ledgers import assert_closes, record, sites_and_seasons
@@ -139,6 +140,16 @@ def test_pumps_without_cooling_do_not_heat_the_hall(plant: str) -> None:
         result, _ = steady([*DRY.get(plant, []), lost % kind], [38.0], [22.0])
         assert result.heat_removed_w == result.chiller_load_w == 0
         assert (result.chilled_pump_w == 0) == (kind == "pump_down")
+
+
+def test_plants_have_a_default_chiller() -> None:
+    for plant, model in (("water_cooled", "centrifugal_vsd"), ("air_cooled", "eir_air_cooled"),
+                         ("air_side", "eir_air_cooled"), ("null", "centrifugal_vsd")):  # fmt: skip
+        config = load_config("corrected", [f"hvac.plant={plant}"])
+        assert config.hvac.chiller_in_use == model
+        assert build_fleet(config).models["chiller"] == model
+    named = load_config("corrected", ["hvac.chiller.model=eir_air_cooled"])
+    assert named.hvac.plant_in_use == "air_cooled"
 
 
 def test_air_cooled_chiller_in_a_desert_july_sees_the_air_and_uses_no_water() -> None:
@@ -415,8 +426,8 @@ def test_ledgers_of_dry_plants_close_on_every_step(plant: str, thermal: str) -> 
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
-        (["hvac.plant=air_cooled"], ["plant air_cooled", "chiller.model centrifugal_vsd",
-                                     ", electric_air_cooled"]),
+        (["hvac.plant=air_cooled", "hvac.chiller.model=carnot"],
+         ["plant air_cooled", "chiller.model carnot", ", eir_air_cooled, electric_air_cooled"]),
         (["hvac.plant=water_cooled", *DRY["air_cooled"]],
          ["plant water_cooled", "chiller.model electric_air_cooled"]),
         (["hvac.outdoor_air.max_dew_point_c=-20"], ["min_dew_point_c -9", "max_dew_point_c -20"]),

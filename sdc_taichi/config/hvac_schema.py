@@ -26,7 +26,7 @@ from sdc_taichi.config.fields import (
 from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
 from sdc_taichi.plant.chiller import CHILLERS, MIN_LIFT_K
 from sdc_taichi.plant.cooling import COOLING_LOADS, CRAC_FLOWS, SETPOINTS
-from sdc_taichi.plant.plants import PLANTS, fits, plant_of
+from sdc_taichi.plant.plants import PLANTS, default_chiller, fits, plant_of
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER
 from sdc_taichi.types import F64
@@ -199,9 +199,10 @@ class CracConfig(Section):
 class ChillerConfig(Section):
     """Chiller model and its reference point."""
 
-    model: Annotated[str, NameIn(CHILLERS)] = "centrifugal_vsd"
+    model: Annotated[str, NameIn(CHILLERS)] | None = None
     """Chiller model: power and capacity as functions of load and temperatures. The chilled water is
-    never warmer than the valid range of the model."""
+    never warmer than the valid range of the model. None means ``centrifugal_vsd`` for plant
+    ``water_cooled``, and ``eir_air_cooled`` for the other plants."""
     reference_cop: Annotated[float, Field(ge=0.5, le=50)] | None = None
     """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
     to Carnot's limit at a lift of 6 K; None uses the default of the model."""
@@ -383,7 +384,7 @@ class HvacConfig(Section):
     """Cooling plant: ``water_cooled`` with a cooling tower and a water-side economiser,
     ``air_cooled`` with an air-cooled chiller and a dry cooler, or ``air_side`` with outdoor air in
     the hall and an air-cooled chiller for the remaining heat. None means ``water_cooled`` if tower
-    water can cool the condenser of the chiller, else ``air_cooled``."""
+    water can cool the condenser of the configured chiller, else ``air_cooled``."""
     cooling_load_model: Annotated[str, NameIn(COOLING_LOADS)] = "heat_balance"
     """Model of return air and cooling load: a heat balance of the hall, or the formulas of the
     released SustainDC or of its paper."""
@@ -420,12 +421,22 @@ class HvacConfig(Section):
     @property
     def plant_in_use(self) -> Plant:
         """Name of the configured plant, or of the chiller's default plant if none is configured."""
-        return plant_of(CHILLERS[self.chiller.model]) if self.plant is None else self.plant
+        if self.plant is not None:
+            return self.plant
+        model = self.chiller.model
+        return "water_cooled" if model is None else plant_of(CHILLERS[model])
+
+    @property
+    def chiller_in_use(self) -> str:
+        """Name of the configured chiller model, or the default of the plant if none is."""
+        if self.chiller.model is not None:
+            return self.chiller.model
+        return default_chiller(PLANTS[self.plant_in_use])
 
     @model_validator(mode="after")
     def _chiller_fits_the_plant(self) -> Self:
         plant = PLANTS[self.plant_in_use]
-        if not fits(CHILLERS[self.chiller.model], plant):
+        if not fits(CHILLERS[self.chiller_in_use], plant):
             fitting = {name for name, chiller in CHILLERS.items() if fits(chiller, plant)}
             valid = ", ".join(sorted(fitting if plant.dry else set(CHILLERS) - fitting))
             raise ValueError(
@@ -436,7 +447,8 @@ class HvacConfig(Section):
 
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
-        bounds_c = CHILLERS[self.chiller.model].chilled_water_bounds_c
+        model = self.chiller_in_use
+        bounds_c = CHILLERS[model].chilled_water_bounds_c
         water, rise = self.setpoint.min_c - self.chiller.coil_approach_k, ""
         if self.crac.temperature_control == "return":
             rise_k = 1.0 / (USUAL_AIR_J_PER_M3_K * self.crac.supply_m3s_per_w)
@@ -446,6 +458,6 @@ class HvacConfig(Section):
             raise ValueError(
                 f"setpoint.min_c {self.setpoint.min_c:g} less chiller.coil_approach_k "
                 f"{self.chiller.coil_approach_k:g}{rise} asks for chilled water of {water:.4g} C; "
-                f"model {self.chiller.model} is valid within {low:g}..{high:g} C"
+                f"model {model} is valid within {low:g}..{high:g} C"
             )
         return self

@@ -319,6 +319,11 @@ def plant_of(chiller: ChillerModel) -> str:
     return "water_cooled" if chiller.tower_water else "air_cooled"
 
 
+def default_chiller(plant: PlantModel) -> str:
+    """Return the name of the default chiller model of a plant."""
+    return "eir_air_cooled" if plant.dry else "centrifugal_vsd"
+
+
 def fits(chiller: ChillerModel, plant: PlantModel) -> bool:
     """Return True if the plant provides the medium that cools the chiller's condenser."""
     return chiller.outdoor_air if plant.dry else chiller.tower_water

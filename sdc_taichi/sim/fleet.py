@@ -288,6 +288,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     shared = {path: _shared(listed, path) for path in SHARED_FIELDS}
     models = {stage: shared[path] for stage, path in STAGE_MODELS.items()}
     models["plant"] = listed[0].hvac.plant_in_use
+    models["chiller"] = listed[0].hvac.chiller_in_use
     halls = _distinct_halls(listed)
     warn_of([(config.name, hall.odd) for config, hall in zip(listed, halls, strict=True)])
     racks = np.array([len(h.groups_per_rack) for h in halls])
