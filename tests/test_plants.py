@@ -14,7 +14,7 @@ from model_steps import chiller_step
 from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import PhysicalLimitError
-from sdc_taichi.plant import plants
+from sdc_taichi.plant import moist_air, plants
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint, fits
 from sdc_taichi.plant.tower import TOWERS
@@ -233,6 +233,31 @@ def test_outdoor_air_that_is_too_dry_is_wetted_or_left_outside() -> None:
     left, _ = steady([*DRY["air_side"], "hvac.outdoor_air.humidifier=false"], *frost)
     assert left.economiser_w == left.water_l == 0
     assert left.chiller_load_w == left.heat_removed_w + pump_heat_w(left)
+
+
+def test_moisture_that_condenses_on_the_coils_is_a_load_of_the_chiller() -> None:
+    # Air of 20 C with a dew point of 11.6 C, chilled water of 10 C, and coils that cool from 20 to
+    # 18 C; limits that admit all of the air.
+    admitting = ["hvac.outdoor_air.max_dew_point_c=25", "hvac.outdoor_air.max_humidity_pct=100"]
+    result, design = steady([*DRY["air_side"], *admitting], [20.0, 20.0], [14.8, 12.0])
+    flow_w_k = design.air_j_per_m3_k * result.crac_flow_m3s
+    sensible_w = flow_w_k * (result.return_c - 20.0)
+    coil_w = result.heat_removed_w - sensible_w
+    latent_w = result.chiller_load_w - coil_w - pump_heat_w(result)
+    np.testing.assert_allclose(result.economiser_w, sensible_w - latent_w, rtol=1e-9)
+    assert latent_w[1] == pytest.approx(0.0, abs=1.0)
+    # Kilograms of water per kilogram of air: outdoors, at the coil, and from the balance of the
+    # hall between them, in which the coils bring a share of the air to 10 C.
+    outdoors, at_coil = (
+        moist_air.vapour_ratio(pa, design.pressure_pa[0])
+        for pa in (plants._vapour_pa(np.array([20.0]), np.array([14.8]), design.pressure_pa[:1]),
+                   moist_air.saturation_pa(10.0))
+    )  # fmt: skip
+    share = (coil_w / flow_w_k / (20.0 - 10.0))[0]
+    hall = (outdoors + share * at_coil) / (1.0 + share)
+    condensed_w = 2486.0 * flow_w_k[0] * share * (hall - at_coil)
+    assert latent_w[0] == pytest.approx(float(condensed_w[0]), rel=1e-3)
+    assert 0.1 < latent_w[0] / coil_w[0] < 0.4
 
 
 @pytest.mark.parametrize(

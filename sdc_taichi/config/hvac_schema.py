@@ -281,7 +281,8 @@ class OutdoorAirConfig(Section):
 
     The default limits of moisture are those that ASHRAE TC 9.9 recommends (Thermal Guidelines for
     Data Processing Environments, 5th edition, 2021). The allowable range of class A1 is a dew point
-    of -12..17 C and a relative humidity of up to 80 %.
+    of -12..17 C and a relative humidity of up to 80 %. The dampers close gradually over the tenth
+    of the vapour pressure next to a limit.
     """
 
     min_dew_point_c: DewPointC = -9.0
