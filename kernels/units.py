@@ -315,12 +315,46 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
 
 @ti.func
 @no_type_check
+def share_with_water(hall: ti.template(), n, running_w, wanted_w):
+    """Let chilled water and tank take up heat that the plant does not; return plant and coils, W.
+
+    Pumps and fans move heat between room and water much faster than either warms. Both therefore
+    end a substep equally far above their setpoints, by (E_room + E_water)/(C_room + C_water),
+    unless this exceeds what coils and pumps can carry. A stratified tank supplies water at the
+    setpoint until warm water fills it. Spare capacity of the plant cools water and room first, then
+    the tank.
+
+    Args:
+        hall: arguments of the hall kernel.
+        n: index of the data center.
+        running_w: heat from return air and fans that reaches the running coils, in W.
+        wanted_w: this heat and the heat stored in the room, at least 0, in W.
+    """
+    dc, h = hall.dcs[n], hall.substep_s
+    carried_w = ti.max(dc.carried_w, dc.coil_limit_w)
+    load_w = ti.min(wanted_w, carried_w) + dc.water_j / h
+    recharge_w = ti.select(dc.tank_share > 0.0, dc.tank_j / h, 0.0)
+    plant_w = ti.min(ti.max(load_w + recharge_w, 0.0), dc.coil_limit_w)
+    most_w = ti.max(dc.tank_share * dc.tank_most_j - dc.tank_j, 0.0) / h
+    tank_w = ti.min(ti.max(load_w - plant_w, -recharge_w), most_w)
+    sink_w = plant_w + tank_w
+    stored_j = dc.room_j + dc.water_j + (running_w - sink_w) * h
+    warmed_k = stored_j / (dc.room_j_per_k + dc.water_j_per_k)
+    coil_w = running_w + (dc.room_j - dc.room_j_per_k * warmed_k) / h
+    coil_w = ti.min(ti.max(coil_w, 0.0), carried_w)
+    dc.water_j = dc.water_j + (coil_w - sink_w) * h
+    dc.tank_j = dc.tank_j + tank_w * h
+    return plant_w, coil_w
+
+
+@ti.func
+@no_type_check
 def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
-    """Return the heat that reaches the coils in a substep, and the heat that they remove, in W.
+    """Return the heat that reaches the coils in a substep, and what the plant removes, in W.
 
     The heat that warms the air in the casings does not reach the coils. Coils remove the heat that
-    brings supply air back to its setpoint, up to the limit of the plant. The room stores the rest,
-    which warms the supply air of the next substep.
+    brings supply air back to its setpoint, up to the limit of the plant. The room and the chilled
+    water store the rest, which warms the supply air of the next substep.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
@@ -329,7 +363,10 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
     running_w = air * (return_c * units.running_m3s - units.running_m3k_s) + fans_w
     running_w -= units.running_casings_w
     wanted_w = ti.max(running_w + units.any_running * dc.room_j / hall.substep_s, 0.0)
-    coil_w = ti.min(wanted_w, dc.coil_limit_w)
+    plant_w = ti.min(wanted_w, dc.coil_limit_w)
+    coil_w = plant_w
+    if dc.water_j_per_k > 0.0 and dc.carried_w > 0.0:
+        plant_w, coil_w = share_with_water(hall, n, running_w, wanted_w)
     room_j = dc.room_j + (load_w - coil_w) * hall.substep_s
     dc.room_j = room_j
     warmed_k = room_j / dc.room_j_per_k
@@ -345,7 +382,7 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
             unit.coil_c = coil_c
             unit.supply_c = coil_c
             at += hall.one
-    return load_w, coil_w
+    return load_w, plant_w
 
 
 @ti.func

@@ -149,7 +149,7 @@ class State:
     """Energy in the battery, in kWh, (B,)."""
     room_heat_kwh: F64
     """Heat stored in the room relative to the room at the setpoint, in kWh, (B,); negative while
-    the air is colder than the setpoint."""
+    the air is colder than the setpoint. In transient halls with that in the chilled water."""
     rack_status: Status
     """Status of each rack: 0 normal, 1 throttled, 2 tripped, (R,)."""
     restart_wait_min: F64
@@ -183,6 +183,12 @@ class State:
     halls."""
     return_air_c: F64
     """Temperature of the return air of the CRAC units, in C, (B,); only in transient halls."""
+    water_heat_j: F64
+    """Heat stored in the chilled water, with that of a mixed tank, relative to the water at its
+    setpoint, in J, (B,); only in transient halls."""
+    tank_heat_j: F64
+    """Heat stored in a stratified tank relative to water at its setpoint, in J, (B,); only in
+    transient halls."""
 
 
 DATA_CENTERS, CRAC_UNITS, RACKS = "B", "U", "R"
@@ -395,7 +401,8 @@ class PlantQuantities:
     rejected_w: Annotated[F64, Quantity("W")]
     """Heat rejected to the outdoors."""
     chilled_water_c: Annotated[F64, Quantity("C")]
-    """Temperature of the chilled water supply."""
+    """Temperature of the chilled water supply; in transient halls at the end of the step, with the
+    warming by heat that the plant did not remove."""
     condenser_water_c: Annotated[F64, Quantity("C")]
     """Temperature of the water leaving the cooling tower, or of the outdoor air that cools an
     air-cooled condenser."""
@@ -438,7 +445,12 @@ class RoomQuantities:
     recovered_w: Annotated[F64, Quantity("W")]
     """Heat stored in the room by earlier steps that spare cooling capacity removes."""
     room_heat_kwh: Annotated[F64, Quantity("kWh")]
-    """Heat stored in the room at the end of the step, relative to the room at the setpoint."""
+    """Heat stored in the room at the end of the step, relative to the room at the setpoint; in
+    transient halls with that in the chilled water and its tank."""
+    water_heat_kwh: Annotated[F64, Quantity("kWh")]
+    """Part of ``room_heat_kwh`` in the chilled water, with that of a mixed buffer tank."""
+    tank_heat_kwh: Annotated[F64, Quantity("kWh")]
+    """Part of ``room_heat_kwh`` in a stratified buffer tank."""
 
 
 @dataclass

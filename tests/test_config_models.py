@@ -38,6 +38,7 @@ EVENTS: dict[EventKind, dict[str, Any]] = {
     "crac_down": {"unit": 1},
     "chiller_derate": {"share": 0.3},
     "pump_down": {"share": 0.5},
+    "tank_down": {"share": 0.0},
     "tower_cell_down": {"share": 0.5},
     "dry_cooler_down": {"share": 0.5},
     "outdoor_air_closed": {"share": 0.0},

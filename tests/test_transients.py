@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import fields, replace
 from typing import Any
 
@@ -29,6 +30,7 @@ from sdc_taichi import (
     Actions,
     DataCenterConfig,
     Drivers,
+    SdcError,
     Simulator,
     build_fleet,
     drivers_from_arrays,
@@ -36,7 +38,15 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.hall_solver import (
+    ChilledWater,
+    Coil,
+    Conditions,
+    Hall,
+    HallState,
+    HallSums,
+    Precision,
+)
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
@@ -72,6 +82,20 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
         supply_excess_k=rng.uniform(0.0, 3.0, fleet.units),
         casing_c=rng.uniform(16, 40, fleet.units),
         return_air_c=rng.uniform(25, 40, fleet.size),
+        water_heat_j=np.zeros(fleet.size),
+        tank_heat_j=np.zeros(fleet.size),
+    )
+
+
+def random_water(rng: np.random.Generator, fleet: Fleet) -> ChilledWater:
+    """Water and tanks of any size, and pumps that fail."""
+    servers = fleet.per_dc_servers()
+    design_w = fleet.unit_design_m3s.sum() / fleet.size * 1.7e4
+    return ChilledWater(
+        carried_w=rng.choice([0.0, 0.7, 10.0], fleet.size) * design_w,
+        j_per_k=rng.choice([0.0, 1e3, 1e4], fleet.size) * servers,
+        tank_most_j=rng.choice([0.0, 3e4], fleet.size) * servers,
+        tank_share=rng.choice([0.0, 0.5, 1.0], fleet.size),
     )
 
 
@@ -284,6 +308,7 @@ def test_heat_that_comes_in_stays_or_leaves(precision: Precision, seed: int) -> 
     for _ in range(3):
         met = random_conditions(rng, configs)
         coil = replace(random_coil(rng, fleet, met.unit_supply_c), room_j=room_j)
+        coil = replace(coil, water=random_water(rng, fleet))
         before = held_j(fleet, state, room_j)
         sums, state = hall.advance(met, state, coil, 900.0, 60.0)
         room_j = sums.room_j
@@ -497,7 +522,8 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(fleet_of(config), precision)
         of_units = "need_m3s", "following", "supply_excess_k", "casing_c"
-        where = {"server_c": part.groups, "return_air_c": slice(i, i + 1)}
+        of_dc = "return_air_c", "water_heat_j", "tank_heat_j"
+        where = {"server_c": part.groups} | dict.fromkeys(of_dc, slice(i, i + 1))
         where |= dict.fromkeys(of_units, part.units)
         own = own_conditions(met, configs, i)
         start = alone.steady_state(replace(own, powered=None))
@@ -522,3 +548,127 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
         for f in fields(layers):
             found = getattr(layers, f.name)[part.servers]
             assert np.array_equal(getattr(alone.servers(), f.name), found), (config.name, f.name)
+
+
+# --- chilled water and buffer tanks -------------------------------------------------------------
+
+TRIP_H = 0.25
+WATER = {
+    "none": ["hvac.chilled_water.volume_l_per_kw=0"],
+    "loop": [],
+    "mixed": ["hvac.chilled_water.tank_m3=20", "hvac.chilled_water.tank=mixed"],
+    "stratified": ["hvac.chilled_water.tank_m3=20"],
+}
+
+
+def tripped_chillers(*events: str, names: Any = (*WATER,), steps: int = 90) -> Any:
+    """Minutes of halls at full load whose chillers trip; results by quantity, (T, B)."""
+    configs = [
+        load_config(
+            "corrected",
+            ["simulation.thermal=transient", "simulation.steps_per_hour=60", "hvac.crac.units=4",
+             *WATER[name], f"name={name}", f"events.scheduled=[{', '.join(events)}]"],
+        )
+        for name in names
+    ]  # fmt: skip
+    results = []
+    with Simulator(configs, drivers=constant_drivers(len(configs), 1.0), precision="f64") as sim:
+        sim.reset()
+        for _ in range(steps):
+            results.append(sim.step().per_dc())
+        capacity_kwh = sim.sizing.chilled_water.stratified_tank_j / 3.6e6
+    return {name: np.array([r[name] for r in results]) for name in results[0]}, capacity_kwh
+
+
+def loses(kind: str, duration_h: float = 0.25, share: float = 0.0) -> str:
+    return f"{{kind: {kind}, start_h: {TRIP_H}, duration_h: {duration_h}, share: {share}}}"
+
+
+def test_water_takes_up_the_heat_of_a_chiller_that_trips_and_returns_it() -> None:
+    run, tank_kwh = tripped_chillers(loses("chiller_derate"), steps=150)
+    # After five minutes, the more water a hall has the colder it is; a stratified tank keeps it.
+    inlet_c, water_c = run["inlet_mean_c"], run["chilled_water_c"]
+    assert np.all(np.diff(inlet_c[20]) < -1.0)
+    assert inlet_c[20, 3] < inlet_c[14, 3] + 0.1
+    np.testing.assert_allclose(water_c[:15], water_c[[0]].repeat(15, axis=0), atol=1e-9)
+    assert np.all(water_c[20, [1, 2]] > water_c[0, [1, 2]] + 2.0)
+    assert water_c[20, 3] == pytest.approx(water_c[0, 3], abs=1e-9)
+    # Warm water fills the tank, and the loop warms only then.
+    assert tank_kwh[:3].tolist() == [0.0, 0.0, 0.0]
+    assert run["tank_heat_kwh"][:, 3].max() == pytest.approx(tank_kwh[3])
+    assert np.all(np.diff(run["tank_heat_kwh"][15:24, 3]) > 0)
+    # All that is generated is removed or stored, and the plant gives back what was stored.
+    rise_kwh = np.diff(run["room_heat_kwh"], axis=0)
+    kept_w = run["it_w"] + run["crac_fan_w"] - run["heat_removed_w"] - run["thermal_storage_w"]
+    np.testing.assert_allclose(rise_kwh, kept_w[1:] / 6e4, atol=1e-7)
+    stored_kwh = run["water_heat_kwh"] + run["tank_heat_kwh"]
+    assert np.all(stored_kwh[29, 1:] > 10.0)
+    assert np.all(run["heat_removed_w"][31, 1:] > run["cooling_load_w"][31, 1:] * 1.01)
+    assert np.all(np.abs(run["room_heat_kwh"][-1]) < 1e-6)
+
+
+def test_water_stands_still_while_its_pumps_are_down() -> None:
+    run, _ = tripped_chillers(
+        loses("chiller_derate", 0.1), loses("pump_down", 0.1).replace("0.25", "0.35"), steps=40
+    )
+    water_kwh = run["water_heat_kwh"] + run["tank_heat_kwh"]
+    assert np.all(water_kwh[20, 1:] > 1.0)
+    np.testing.assert_allclose(water_kwh[26], water_kwh[22], atol=1e-12)
+    assert np.all(np.abs(run["heat_removed_w"][22:26]) < 1e-6)
+    assert np.all(run["inlet_mean_c"][26] > run["inlet_mean_c"][22] + 1.0)
+
+
+def test_a_tank_that_is_cut_off_takes_up_nothing() -> None:
+    run, tank_kwh = tripped_chillers(
+        loses("chiller_derate"), loses("tank_down"), names=("loop", "mixed", "stratified"), steps=30
+    )
+    np.testing.assert_allclose(
+        run["inlet_mean_c"], run["inlet_mean_c"][:, [0]].repeat(3, axis=1), atol=1e-6
+    )
+    half, _ = tripped_chillers(loses("chiller_derate"), loses("tank_down", share=0.5), steps=30)
+    assert half["tank_heat_kwh"][:, 3].max() == pytest.approx(0.5 * tank_kwh[2])
+
+
+def test_halls_with_water_equal_themselves_alone_and_after_a_saved_state() -> None:
+    names = ("stratified", "loop", "mixed")
+    together, _ = tripped_chillers(loses("chiller_derate", 0.2), names=names, steps=45)
+    for i, name in enumerate(names):
+        alone, _ = tripped_chillers(loses("chiller_derate", 0.2), names=(name,), steps=45)
+        for quantity, values in alone.items():
+            assert np.array_equal(values[:, 0], together[quantity][:, i]), (name, quantity)
+    config = load_config(
+        "corrected",
+        ["simulation.thermal=transient", "hvac.chilled_water.tank_m3=20",
+         f"events.scheduled=[{loses('chiller_derate', 1.0)}]"],
+    )  # fmt: skip
+    with Simulator(config, drivers=constant_drivers()) as sim:
+        sim.reset()
+        for _ in range(3):
+            sim.step()
+        saved = sim.state_dict()
+        assert saved["tank_heat_j"][0] > 0.0
+        expected = sim.step().inlet_max_c[0]
+        sim.reset()
+        sim.load_state_dict(saved)
+        assert sim.step().inlet_max_c[0] == expected
+        with pytest.raises(SdcError, match="snapshot: version 3, expected 4"):
+            old = {n: v for n, v in saved.items() if n != "tank_heat_j"}
+            sim.load_state_dict(old | {"version": np.array(3)})
+
+
+def test_quasi_steady_halls_ignore_their_water_and_say_so() -> None:
+    found = []
+    for overrides in WATER.values():
+        config = load_config("corrected", overrides)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            fleet = build_fleet(config)
+        assert any("tank acts only" in str(w.message) for w in caught) == (
+            config.hvac.chilled_water.tank_m3 > 0
+        )
+        with Simulator(fleet, drivers=constant_drivers()) as sim:
+            sim.reset()
+            result = sim.step()
+            assert result.water_heat_kwh[0] == result.tank_heat_kwh[0] == 0.0
+            found.append(float(result.hvac_w[0]))
+    assert found == [found[0]] * 4

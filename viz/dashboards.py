@@ -90,6 +90,7 @@ EVENT_SHADES = {
     "crac_down": (BLUE, "//"),
     "chiller_derate": (GREEN, "\\\\"),
     "pump_down": (GREEN, "||"),
+    "tank_down": (GREEN, ".."),
     "tower_cell_down": (GREEN, "xx"),
     "dry_cooler_down": (GREEN, "++"),
     "outdoor_air_closed": (GREEN, "oo"),

@@ -247,14 +247,26 @@ def _print_study(study: Failover) -> None:
     )
     table = Table()
     table.add_column("lost", no_wrap=True)
-    names = ("throttle, min", "trip, min", *(f"C, {m} min" for m in SHOWN_AFTER_MIN), "racks off")
+    has_tank = bool(np.isfinite(study.tank_full_min).any())
+    names = (
+        *("throttle, min", "trip, min"),
+        *(f"C, {m} min" for m in SHOWN_AFTER_MIN),
+        *(("tank, min",) if has_tank else ()),
+        "racks off",
+    )
     for name in names:
         table.add_column(name, justify="right")
     order = [0, *(i for i in study.worst if i != 0)]
     for row in failover_rows(study, order[: LISTED + 1]):
-        name, *numbers, off = row.values()
-        minutes = ("-" if x is None else f"{x:.0f}" for x in numbers[:2])
-        table.add_row(name, *minutes, *(f"{x:.1f}" for x in numbers[2:]), f"{off}")
+        name, throttle, trip, *inlets_c, _, tank, off = row.values()
+        minutes = ["-" if x is None else f"{x:.0f}" for x in (throttle, trip, tank)]
+        table.add_row(
+            name,
+            *minutes[:2],
+            *(f"{x:.1f}" for x in inlets_c),
+            *minutes[2:][: int(has_tank)],
+            f"{off}",
+        )
     Console().print(table)
     if len(order) > LISTED + 1:
         typer.echo(f"The worst {LISTED} of {len(order) - 1} losses.")
@@ -262,7 +274,8 @@ def _print_study(study: Failover) -> None:
         typer.echo(study.note)
     typer.echo(
         "C is the hottest inlet of the hall; times count to the end of a whole minute, - is not "
-        f"within {MINUTES} min; racks off are those after {MINUTES} min."
+        f"within {MINUTES} min; tank is the time until warm water fills the buffer tank; racks off "
+        f"are those after {MINUTES} min."
     )
 
 

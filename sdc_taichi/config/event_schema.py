@@ -12,6 +12,7 @@ EventKind = Literal[
     "crac_down",
     "chiller_derate",
     "pump_down",
+    "tank_down",
     "tower_cell_down",
     "dry_cooler_down",
     "outdoor_air_closed",
@@ -39,6 +40,7 @@ _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "crac_down": (),
     "chiller_derate": ("share",),
     "pump_down": ("share",),
+    "tank_down": ("share",),
     "tower_cell_down": ("share",),
     "dry_cooler_down": ("share",),
     "outdoor_air_closed": ("share",),
@@ -112,8 +114,8 @@ class ScheduledEvent(Section):
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
     """Number of the rack whose fans fail, counted from 0, row by row."""
     share: Share | None = None
-    """Chiller capacity, pumps, tower cells, dry coolers, openings for outdoor air or rack airflow
-    that remain, as a share of all, 0..1."""
+    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air or
+    rack airflow that remain, as a share of all, 0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 
@@ -136,8 +138,8 @@ class SampledEvent(Section):
     duration_h: tuple[DurationH, DurationH]
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
-    """Chiller capacity, pumps, tower cells, dry coolers, openings for outdoor air or rack airflow
-    that remain, as a share of all, 0..1."""
+    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air or
+    rack airflow that remain, as a share of all, 0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 

@@ -333,6 +333,24 @@ class PumpConfig(Section):
     """Power of the condenser-water pump of pump model ``released``, in W."""
 
 
+class ChilledWaterConfig(Section):
+    """Chilled water and buffer tank, which store heat in transient halls.
+
+    They take up the heat that the plant does not remove while pumps and CRAC fans run. Quasi-steady
+    halls ignore both.
+    """
+
+    volume_l_per_kw: Annotated[float, Field(ge=0, le=1000)] = 6.46
+    """Chilled water in pipes, coils and chiller divided by the cooling capacity, in l/kW, 0..1,000.
+    Chillers need at least 3.25 l/kW, and 6.46 to 10.76 l/kW where temperatures are critical
+    (Carrier, AquaForce 30XA manual)."""
+    tank_m3: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Water in the buffer tank, in m3, 0..1e6; 0 means no tank."""
+    tank: Literal["mixed", "stratified"] = "stratified"
+    """Kind of tank: ``mixed``, whose water warms with the loop, or ``stratified``, which supplies
+    cold water until warm water fills it."""
+
+
 class WaterConfig(Section):
     """Make-up water of the cooling tower."""
 
@@ -397,6 +415,8 @@ class HvacConfig(Section):
     """Dry cooler of plant ``air_cooled``."""
     outdoor_air: OutdoorAirConfig = OutdoorAirConfig()
     """Outdoor air of plant ``air_side``."""
+    chilled_water: ChilledWaterConfig = ChilledWaterConfig()
+    """Chilled water and buffer tank."""
     pumps: PumpConfig = PumpConfig()
     """Pumps of chilled water and condenser water."""
     water: WaterConfig = WaterConfig()

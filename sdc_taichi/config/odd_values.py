@@ -56,6 +56,12 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             f"hvac.pumps.efficiency {pumps.efficiency:g}: even small pumps reach "
             f"{LEAST_USUAL_PUMP_EFFICIENCY:g}"
         )
+    tank_m3 = config.hvac.chilled_water.tank_m3
+    if tank_m3 > 0 and config.simulation.thermal == "quasi_steady":
+        yield (
+            f"hvac.chilled_water.tank_m3 {tank_m3:g}: a tank acts only with simulation.thermal "
+            "transient"
+        )
     ratio = config.electrical.grid_limit_ratio
     if config.electrical.grid_limit_kw is None and (ratio or 1.0) < LEAST_USUAL_GRID_RATIO:
         yield (
@@ -75,6 +81,7 @@ def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
     for config in configs:
         # Copies of a data center share section objects, so each section is checked only once.
         sections = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
+        sections += (config.simulation.thermal == "transient",)
         if sections not in texts_of:
             texts_of[sections] = [*odd_values(config)]
         messages.append((config.name, texts_of[sections]))

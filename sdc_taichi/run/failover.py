@@ -24,7 +24,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.run.metrics import finite_or_none
-from sdc_taichi.sim.air import SHORTEST_SUBSTEP_S
+from sdc_taichi.sim.air import J_PER_KWH, SHORTEST_SUBSTEP_S
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
@@ -45,9 +45,12 @@ MOST_UNIT_SHARES = 100_000_000
 """Maximum number of shares of units in the supply of racks, summed over all losses: about 2 GB."""
 SHOWN_AFTER_MIN = (15, 60)
 """Minutes after which studies report the hottest inlet."""
+FULL = 0.999
+"""Heat in a stratified tank divided by the most that it takes up, from which it counts as full."""
 DEVICES: dict[EventKind, str] = {
     "chiller_derate": "chiller",
     "pump_down": "chilled-water pumps",
+    "tank_down": "buffer tank",
     "tower_cell_down": "tower cells",
     "dry_cooler_down": "dry cooler",
     "outdoor_air_closed": "outdoor air",
@@ -100,6 +103,11 @@ class Failover:
     """Minutes until the first rack trips, nan if none does, (N,)."""
     racks_off: F64
     """Number of racks that are off at the end, (N,)."""
+    chilled_water_c: F64
+    """Chilled water supply at the end of each minute, in C, (T, N)."""
+    tank_full_min: F64
+    """Minutes until warm water fills the stratified buffer tank, nan if it does not or if there is
+    no such tank, (N,)."""
 
     @property
     def worst(self) -> list[int]:
@@ -149,8 +157,13 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     )
     with Simulator(build_fleet(copies), drivers=drivers) as sim:
         sim.reset()
+        tank_most_kwh = sim.sizing.chilled_water.stratified_tank_j / J_PER_KWH
         results = [_copied(sim.step(), step) for step in range(MINUTES)]
     throttled, tripped = (np.array([r[name] for r in results]) for name in ("hot", "tripped"))
+    tank_kwh = np.array([r["tank_kwh"] for r in results])
+    tank_left = [
+        next((e.share for e in loss.events if e.kind == "tank_down"), 1.0) for loss in losses
+    ]
     shown = results[SHOWN_AFTER_MIN[0] - 1]["rack_inlet_c"]
     return Failover(
         config=base,
@@ -165,6 +178,8 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
         throttle_min=_first_minute(throttled > 0),
         trip_min=_first_minute(tripped > 0),
         racks_off=tripped[-1],
+        chilled_water_c=np.array([r["chilled_water_c"] for r in results]),
+        tank_full_min=_first_minute((tank_kwh > 0) & (tank_kwh > FULL * tank_most_kwh * tank_left)),
     )
 
 
@@ -197,17 +212,22 @@ def unit_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
 
 
 def plant_losses(config: DataCenterConfig) -> tuple[Loss, ...]:
-    """Return the case without a loss, and the loss of half and all of each plant device."""
-    plant = config.hvac.plant_in_use
-    return (
-        Loss("no loss", (), ()),
-        *(
-            Loss(name, (), (_event(kind, share=share),))
-            for kind, device in DEVICES.items()
-            if PLANT_OF_EVENT.get(kind, plant) == plant
-            for name, share in ((f"half of {device}", 0.5), (device, 0.0))
-        ),
-    )
+    """Return the case without a loss, and the loss of half and all of each plant device.
+
+    A buffer tank, which alone is not missed, is lost together with the chiller.
+    """
+    plant, has_tank = config.hvac.plant_in_use, config.hvac.chilled_water.tank_m3 > 0
+    no_chiller = _event("chiller_derate", share=0.0)
+    losses = [Loss("no loss", (), ())]
+    for kind, device in DEVICES.items():
+        if PLANT_OF_EVENT.get(kind, plant) != plant or (kind == "tank_down" and not has_tank):
+            continue
+        beside = (no_chiller,) if kind == "tank_down" else ()
+        label = f"chiller and {device}" if beside else device
+        half = f"chiller, half of {device}" if beside else f"half of {device}"
+        for name, share in ((half, 0.5), (label, 0.0)):
+            losses.append(Loss(name, (), (*beside, _event(kind, share=share))))
+    return tuple(losses)
 
 
 def _event(kind: Any, **more: Any) -> ScheduledEvent:
@@ -255,6 +275,8 @@ def _copied(result: StepResult, step: int) -> dict[str, Any]:
         "inlet_max_c": result.inlet_max_c,
         "tripped": result.tripped_racks,
         "hot": result.throttled_racks + result.tripped_racks,
+        "chilled_water_c": result.chilled_water_c,
+        "tank_kwh": result.tank_heat_kwh,
     }
     if step == 0:
         values["it_w"] = result.it_w
@@ -296,6 +318,10 @@ def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]
                 f"hottest_inlet_{minute}_min_c": float(study.inlet_max_c[minute - 1, i])
                 for minute in SHOWN_AFTER_MIN
             },
+            f"chilled_water_{SHOWN_AFTER_MIN[0]}_min_c": float(
+                study.chilled_water_c[SHOWN_AFTER_MIN[0] - 1, i]
+            ),
+            "tank_full_min": finite_or_none(study.tank_full_min[i]),
             "racks_off": int(study.racks_off[i]),
         }
         for i in order

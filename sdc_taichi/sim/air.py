@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums
+from sdc_taichi.sim.hall_solver import ChilledWater, Coil, Conditions, Hall, HallState, HallSums
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.step_inputs import Surroundings, UnitIndex
 from sdc_taichi.sim.work_allocation import Placement
@@ -30,6 +30,7 @@ _AXES = {"unit": "U", "rack": "R"}
 entry per data center, B."""
 STATE_AXES = {
     **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh", "return_air_c"), "B"),
+    **dict.fromkeys(("water_heat_j", "tank_heat_j"), "B"),
     **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
     **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),
     **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
@@ -99,8 +100,8 @@ class TransientAir:
         fleet: B data centers.
         hall: Their halls.
         sizing: Their sized devices.
-        removable_w: Function of surroundings and supply that returns the heat that the plant can
-            remove during a step, in W, (B,).
+        limits_w: Function of surroundings and supply that returns the heat that the plant can
+            remove during a step, and the heat that coils and pumps can carry, in W, (B,) each.
         keep_inlets: True if the placement policy reads the inlet temperatures of the last step.
     """
 
@@ -109,11 +110,11 @@ class TransientAir:
         fleet: Fleet,
         hall: Hall,
         sizing: Sizing,
-        removable_w: Callable[[Surroundings, Supply], F64],
+        limits_w: Callable[[Surroundings, Supply], tuple[F64, F64]],
         *,
         keep_inlets: bool,
     ) -> None:
-        self._hall, self._removable_w = hall, removable_w
+        self._hall, self._limits_w, self._water = hall, limits_w, sizing.chilled_water
         self._step_s = 1.0 / fleet.steps_per_hour * 3600.0
         self._substep_s = fleet.configs[0].simulation.substep_s
         self._room_j_per_k = sizing.room_kwh_per_k * J_PER_KWH
@@ -140,12 +141,20 @@ class TransientAir:
         Raises:
             PhysicalLimitError: Temperatures or power overflow.
         """
+        removable_w, carried_w = self._limits_w(surroundings, supply)
+        water, tank_share = self._water, surroundings.tank_share
         coil = Coil(
             setpoint_c=supply.coldest_supply_c,
             room_j=state.room_heat_kwh * J_PER_KWH,
             room_j_per_k=self._room_j_per_k,
-            limit_w=self._removable_w(surroundings, supply),
+            limit_w=removable_w,
             fan_w_per_m3s=self._fan_w_per_m3s * surroundings.powered,
+            water=ChilledWater(
+                carried_w=carried_w,
+                j_per_k=water.loop_j_per_k + tank_share * water.mixed_tank_j_per_k,
+                tank_most_j=water.stratified_tank_j,
+                tank_share=tank_share,
+            ),
         )
         air, after = self._hall.advance(
             # The coil determines the supply temperature of each substep; this one is a start value.
@@ -224,6 +233,9 @@ def held_air(
     axes = {name: _axis(name) for name in fields_of(air)}
     values = with_entries_of(last, fields_of(air), beyond, axes, fleet)
     values["room_j"] = np.where(beyond, state.room_heat_kwh * J_PER_KWH, values["room_j"])
+    for name, stored_j in (("water_j", state.water_heat_j), ("tank_j", state.tank_heat_j)):
+        if len(stored_j):
+            values[name] = np.where(beyond, stored_j, values[name])
     return HallSums(**values), with_entries_of(state, thermal, beyond, STATE_AXES, fleet)
 
 

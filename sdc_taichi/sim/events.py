@@ -28,6 +28,7 @@ _KINDS: tuple[EventKind, ...] = get_args(EventKind)
 _PLANT_SHARES: dict[str, tuple[EventKind, ...]] = {
     "chiller_share": ("chiller_derate",),
     "pump_share": ("pump_down",),
+    "tank_share": ("tank_down",),
     "outdoor_units": ("tower_cell_down", "dry_cooler_down", "outdoor_air_closed"),
 }
 """Event kinds that reduce each share of plant devices, by the field of ``Disturbance``."""
@@ -58,6 +59,8 @@ class Disturbance:
     """True for each data center that the grid supplies, (B,)."""
     pump_share: F64
     """Share of the chilled-water pumps that work, 0..1, (B,)."""
+    tank_share: F64
+    """Share of the buffer tank that is in use, 0..1, (B,)."""
     outdoor_units: F64
     """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
 
@@ -157,6 +160,7 @@ class Timeline:
                 unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
                 pump_share=np.ones(size),
+                tank_share=np.ones(size),
                 outdoor_units=np.ones(size),
                 rack_airflow=np.ones(rack_offsets[-1]),
                 outdoor_offset_k=np.zeros(size),

@@ -123,21 +123,27 @@ class Facility:
         self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
 
     def removable_w(self, surroundings: Surroundings, supply: Supply) -> dict[str, F64]:
-        """Compute the heat that the plant can remove with the coils in use.
+        """Compute the heat that the plant can remove, and that coils and pumps can carry.
 
         Args:
             surroundings: Weather and failures.
             supply: Operation of the CRAC units.
 
         Returns:
-            ``heat_removed_w``, in W, (B,), as the only entry.
+            ``heat_removed_w`` and ``carried_w``, in W, (B,) each.
         """
         capacity_w = self._coil_capacity_w(surroundings, supply)
         flow_m3s = self._sizing.crac_flow_m3s
         rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
         return_c = supply.plant_setpoint_c + rise_k
         plant = self._operate(capacity_w, surroundings, supply, return_c, flow_m3s)
-        return {"heat_removed_w": plant.heat_removed_w}
+        pumped_w = self._sizing.water_side.pumped_w
+        if not self._event_free:
+            pumped_w = pumped_w * surroundings.pump_share * surroundings.powered
+        return {
+            "heat_removed_w": plant.heat_removed_w,
+            "carried_w": np.minimum(capacity_w, pumped_w),
+        }
 
     def step(self, inputs: StepInputs) -> dict[str, F64]:
         """Compute CRAC, plant, water, energy and index quantities of a step.
@@ -290,7 +296,8 @@ class Facility:
         if not self._stores_heat:
             # Adding 0.0 turns a negative zero into 0.
             unmet_w = recovered_w = 0.0 * load_w + 0.0
-        return RoomQuantities(unmet_w, recovered_w, room_heat_kwh)
+        nothing = 0.0 * load_w
+        return RoomQuantities(unmet_w, recovered_w, room_heat_kwh, nothing, nothing)
 
     def _use_water(
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
@@ -431,13 +438,17 @@ class FacilityStage:
         from sdc_taichi.kernels.compiler.stage import CompiledStage
 
         self._recirculates = fleet.models["inlet"] == "recirculation"
+        self._transient = fleet.models["thermal"] == "transient"
         self._step = CompiledStage(lambda **x: _checked_step(facility, **x), fleet.size)
         self._removable = CompiledStage(facility.removable_w, fleet.size)
 
-    def removable_w(self, surroundings: Surroundings, supply: Supply) -> F64:
-        """Return the heat that the plant can remove during a step, in W, (B,)."""
+    def limits_w(self, surroundings: Surroundings, supply: Supply) -> tuple[F64, F64]:
+        """Return the heat that the plant can remove, and that coils and pumps can carry, in a step.
+
+        Both are in W, (B,).
+        """
         results = self._removable(surroundings=surroundings, supply=supply)
-        return results["heat_removed_w"]
+        return results["heat_removed_w"], results["carried_w"]
 
     def step(
         self,
@@ -459,6 +470,10 @@ class FacilityStage:
         results["unit_flow_m3s"] = (
             air.unit_airflow_m3s if self._recirculates else results["crac_flow_m3s"]
         )
+        if self._transient:
+            results["water_heat_kwh"] = air.water_j / 3.6e6
+            results["tank_heat_kwh"] = air.tank_j / 3.6e6
+            results["chilled_water_c"] = results["chilled_water_c"] + air.water_warmed_k
         return results
 
 

@@ -77,6 +77,25 @@ class HallState:
     """Temperature of the air in the casing of each CRAC unit, in C, (U,)."""
     return_air_c: F64
     """Temperature of the return air of the CRAC units, in C, (B,)."""
+    water_heat_j: F64
+    """Heat stored in the chilled water, with that of a mixed tank, relative to the water at its
+    setpoint, in J, (B,)."""
+    tank_heat_j: F64
+    """Heat stored in a stratified tank relative to water at its setpoint, in J, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChilledWater:
+    """Chilled water and buffer tank of transient halls during one step."""
+
+    carried_w: F64
+    """Maximum heat that coils and chilled-water pumps can carry, in W, (B,)."""
+    j_per_k: F64
+    """Heat capacity of the chilled water, with that of a mixed tank, in J/K, (B,)."""
+    tank_most_j: F64
+    """Maximum heat that a stratified tank can store, in J, (B,)."""
+    tank_share: F64
+    """Available share of a stratified tank, 0..1, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +105,16 @@ class Coil:
     setpoint_c: F64
     """Supply setpoint of each CRAC unit, in C, (U,)."""
     room_j: F64
-    """Heat stored in the room at the start of the step, relative to the setpoint, in J, (B,)."""
+    """Heat stored in room and chilled water at the start of the step, relative to the setpoint, in
+    J, (B,)."""
     room_j_per_k: F64
     """Heat capacity of the room, in J/K, (B,)."""
     limit_w: F64
     """Maximum heat that the plant can remove during the step, in W, (B,)."""
     fan_w_per_m3s: F64
     """CRAC fan power divided by airflow, both at full speed, in W/(m3/s), (B,)."""
+    water: ChilledWater | None = None
+    """Chilled water and tank; None for halls without either."""
 
 
 Precision = Literal["f32", "f64"]
@@ -166,14 +188,22 @@ class HallSums(HallQuantities):
     """Heat from return air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in
     quasi-steady halls."""
     coil_w: F64
-    """Heat that the coils remove, in W, (B,); 0 in quasi-steady halls."""
+    """Heat that the plant removes from room and chilled water, in W, (B,); 0 in quasi-steady
+    halls."""
     unit_airflow_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,); meaningless with inlet model ``approach``."""
     cubed_flow_m3s: F64
     """Sum over the running CRAC units of full-speed airflow times the step mean of the cubed
     relative fan speed, in m3/s, (B,); 0 with inlet model ``approach``."""
     room_j: F64
-    """Heat stored in the room at the end of the step, relative to the setpoint, in J, (B,)."""
+    """Heat stored in room and chilled water at the end of the step, relative to the setpoint, in J,
+    (B,)."""
+    water_j: F64
+    """Part of ``room_j`` in the chilled water, with that of a mixed tank, in J, (B,)."""
+    tank_j: F64
+    """Part of ``room_j`` in a stratified tank, in J, (B,)."""
+    water_warmed_k: F64
+    """Temperature of the chilled water minus its setpoint at the end of the step, in K, (B,)."""
 
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
@@ -356,8 +386,9 @@ class Hall:
     def steady_state(self, conditions: Conditions) -> HallState:
         """Return the thermal state of transient halls in equilibrium with constant conditions."""
         self.solve(conditions)
-        for name, value in (("room_j", 0.0), ("room_j_per_k", 1.0), ("coil_limit_w", 0.0)):
-            self._dc[name][:] = value
+        for name in ("room_j", "coil_limit_w", "water_j", "tank_j", *_water_rows(None)):
+            self._dc[name][:] = 0.0
+        self._dc["room_j_per_k"][:] = 1.0
         server_c = np.zeros(self._fleet.groups, self._dtype)
         # One very long substep brings the servers to their steady temperatures. It also changes
         # the air, which is already steady and is therefore restored afterwards.
@@ -403,6 +434,8 @@ class Hall:
             "supply_excess_k": (units, 0.0),
             "casing_c": (units, mean_c[fleet.unit_dc]),
             "return_air_c": (self.beyond_limits, mean_c),
+            "water_heat_j": (self.beyond_limits, 0.0),
+            "tank_heat_j": (self.beyond_limits, 0.0),
         }
         return HallState(
             **{
@@ -556,7 +589,8 @@ class Hall:
         )
         speed = np.clip(following, self._unit["low"], self._unit["high"])
         covers = self._fresh_m3s * speed / np.maximum(need_m3s, 1e-30)
-        warmed_k = (coil.room_j / coil.room_j_per_k)[fleet.unit_dc]
+        room_j = coil.room_j - (state.water_heat_j + state.tank_heat_j)
+        warmed_k = (room_j / coil.room_j_per_k)[fleet.unit_dc]
         coil_c = coil.setpoint_c + warmed_k + state.supply_excess_k
         running = self._unit["running"]
         any_running = fleet.unit_sums(running)[fleet.unit_dc] > 0.0
@@ -573,10 +607,13 @@ class Hall:
         of_dcs = {
             "fan_speed": state.following[fleet.unit_offsets[:-1]],
             "crac_m3s_per_rack": flow_m3s / np.diff(fleet.rack_offsets),
-            "room_j": coil.room_j,
+            "room_j": room_j,
+            "water_j": state.water_heat_j,
+            "tank_j": state.tank_heat_j,
             "room_j_per_k": coil.room_j_per_k,
             "coil_limit_w": coil.limit_w,
             "crac_fan_w_per_m3s": coil.fan_w_per_m3s,
+            **_water_rows(coil.water),
         }
         self._unit["setpoint_c"][:] = coil.setpoint_c
         for row, values in of_units.items():
@@ -821,6 +858,8 @@ class Hall:
             supply_excess_k=self._unit_state["excess_k"].copy(),
             casing_c=self._unit_state["casing_c"].copy(),
             return_air_c=self._dc["return_c"].copy(),
+            water_heat_j=self._dc["water_j"].copy(),
+            tank_heat_j=self._dc["tank_j"].copy(),
         )
 
     def _aligned(self, shape: tuple[int, ...]) -> Any:
@@ -879,9 +918,24 @@ class Hall:
             unit_supply_c=unit_supply_c.copy(),
             unit_airflow_m3s=unit["flow_m3s"].copy(),
             cubed_flow_m3s=cubed_flow_m3s,
-            room_j=self._dc["room_j"].copy(),
+            room_j=self._dc["room_j"] + (self._dc["water_j"] + self._dc["tank_j"]),
+            water_j=self._dc["water_j"].copy(),
+            tank_j=self._dc["tank_j"].copy(),
+            water_warmed_k=self._dc["water_j"] / np.maximum(self._dc["water_j_per_k"], 1e-30),
             **results,
         )
+
+
+def _water_rows(water: ChilledWater | None) -> dict[str, F64 | float]:
+    """Return rows of ``DC_DOUBLES`` with the chilled water of a step; zeros without water."""
+    if water is None:
+        return dict.fromkeys(("carried_w", "water_j_per_k", "tank_most_j", "tank_share"), 0.0)
+    return {
+        "carried_w": water.carried_w,
+        "water_j_per_k": water.j_per_k,
+        "tank_most_j": water.tank_most_j,
+        "tank_share": water.tank_share,
+    }
 
 
 def _condition_shapes(fleet: Fleet) -> dict[str, tuple[int]]:

@@ -23,6 +23,11 @@ from sdc_taichi.types import F64, fields_of
 
 WATER_DENSITY_KG_M3 = 1000.0
 """Density of water, in kg/m3."""
+WATER_J_PER_M3_K = 4.19e6
+"""Volumetric heat capacity of water, in J/(m3 K)."""
+STRATIFIED_SHARE = 0.9
+"""Share of the water of a stratified tank that leaves it at the supply temperature, or figure of
+merit: 0.85..0.95 for tanks in service (Bahnfleth, Musser 1998, ASHRAE Trans. 104(2))."""
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
 """Design dry bulbs of the released SustainDC, in C, by the first two letters of the site; 50 C for
 all other sites."""
@@ -33,6 +38,19 @@ covers the growth of IT power with the setpoint, a few percent."""
 _GRID = np.linspace(0.0, 1.0, 5)
 """Positions, within their ranges, of the water temperatures for which chiller capacity is
 checked."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChilledWaterDesign:
+    """Chilled water and buffer tanks of B data centers, which store heat in transient halls."""
+
+    loop_j_per_k: F64
+    """Heat capacity of the water in pipes, coils and chiller, in J/K, (B,)."""
+    mixed_tank_j_per_k: F64
+    """Heat capacity of the water in a mixed tank, in J/K, (B,); 0 without such a tank."""
+    stratified_tank_j: F64
+    """Heat that a stratified tank takes up at the design range of the water, in J, (B,); 0 without
+    such a tank."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +80,8 @@ class Sizing:
     """Power limit of the grid connection, in kW, (B,); ``NO_LIMIT_KW`` without a limit."""
     room_kwh_per_k: F64
     """Heat capacity of the room, in kWh/K, (B,); in quasi-steady halls with the servers."""
+    chilled_water: ChilledWaterDesign
+    """Chilled water and buffer tank."""
     water_side: WaterSideDesign
     """Sized chiller, tower, pumps and economiser."""
     power_path: PowerPath
@@ -97,9 +117,9 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 
 def _check_sizes(fleet: Fleet, sized: Sizing) -> None:
     """Check that capacities, flows and powers of sized devices are finite and not negative."""
-    sizes = fields_of(sized) | fields_of(sized.water_side)
+    sizes = fields_of(sized) | fields_of(sized.water_side) | fields_of(sized.chilled_water)
     for name, values in sizes.items():
-        if name in ("water_side", "power_path", "machine") or name.endswith("_c"):
+        if name in ("water_side", "power_path", "machine", "chilled_water") or name.endswith("_c"):
             continue
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
@@ -161,6 +181,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         battery_kwh=_battery_kwh(fleet, facility_w * hours / 1e3),
         grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
+        chilled_water=_chilled_water(fleet, cooling_w),
         water_side=water_side,
         power_path=power_path,
     )
@@ -218,6 +239,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
         grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
+        chilled_water=_chilled_water(fleet, rated_w),
         water_side=_water_side(
             fleet, rated_w, rated_w, rated_w, crac_flow_m3s, outdoor_c, wet_bulb_c
         ),
@@ -517,6 +539,20 @@ def _grid_limit_kw(fleet: Fleet, design_kw: F64) -> F64:
     sized_kw = np.where(np.isnan(ratio), NO_LIMIT_KW, ratio * design_kw)
     limit_kw = np.where(np.isnan(configured_kw), sized_kw, configured_kw)
     return np.minimum(limit_kw, NO_LIMIT_KW)
+
+
+def _chilled_water(fleet: Fleet, cooling_w: F64) -> ChilledWaterDesign:
+    """Return the chilled water and the tanks for a cooling capacity in W, (B,)."""
+    v = fleet.values
+    loop_m3 = v("hvac.chilled_water.volume_l_per_kw") * cooling_w / 1e6
+    tank_m3 = v("hvac.chilled_water.tank_m3")
+    is_mixed = np.array([c.hvac.chilled_water.tank == "mixed" for c in fleet.configs])
+    usable_k = STRATIFIED_SHARE * v("hvac.chiller.chilled_water_range_k")
+    return ChilledWaterDesign(
+        loop_j_per_k=WATER_J_PER_M3_K * loop_m3,
+        mixed_tank_j_per_k=WATER_J_PER_M3_K * tank_m3 * is_mixed,
+        stratified_tank_j=WATER_J_PER_M3_K * tank_m3 * usable_k * ~is_mixed,
+    )
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:

@@ -93,6 +93,9 @@ def check_origin(values: Any, fingerprint: str) -> None:
         raise SdcError(
             f"snapshot: is a {type(values).__name__}; valid is what state_dict() returned"
         )
+    if "version" in values:
+        # The fields of another version differ, so its number says more than their names.
+        _check_label(values, "version", VERSION, f"snapshot: version {{}}, expected {VERSION}")
     expected = {f.name for f in fields(State)} | {"version", "fingerprint"}
     missing = sorted(expected - set(values))
     extra = sorted(str(name)[:80] for name in set(values) - expected)
@@ -100,14 +103,25 @@ def check_origin(values: Any, fingerprint: str) -> None:
         raise SdcError(
             f"snapshot: missing {missing}, unknown {extra}; it is no state of this program"
         )
-    for name, wanted in (("version", VERSION), ("fingerprint", fingerprint)):
-        stored, model = as_array(f"snapshot: {name}", values[name]), np.asarray(wanted)
-        if stored.shape != () or stored.dtype != model.dtype:
-            raise SdcError(f"snapshot: {name} is {shortened(stored.tolist())}, expected {wanted!r}")
-        if stored != model and name == "version":
-            raise SdcError(f"snapshot: version {stored}, expected {VERSION}")
-        if stored != model:
-            raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
+    _check_label(
+        values,
+        "fingerprint",
+        fingerprint,
+        "snapshot: made by another fleet, inputs or precision than this one",
+    )
+
+
+def _check_label(values: Mapping[str, Any], name: str, wanted: int | str, message: str) -> None:
+    """Check a label of a snapshot.
+
+    Raises:
+        SdcError: The label has the wrong type or, with ``message``, the wrong value.
+    """
+    stored, model = as_array(f"snapshot: {name}", values[name]), np.asarray(wanted)
+    if stored.shape != () or stored.dtype != model.dtype:
+        raise SdcError(f"snapshot: {name} is {shortened(stored.tolist())}, expected {wanted!r}")
+    if stored != model:
+        raise SdcError(message.format(stored))
 
 
 def to_state(values: Mapping[str, Any], like: State) -> State:

@@ -97,7 +97,7 @@ def make_stages(
     facility = FacilityStage(fleet, models)
     keep = allocation.watches_inlets
     air: SteadyAir | TransientAir = (
-        TransientAir(fleet, hall, sizing, facility.removable_w, keep_inlets=keep)
+        TransientAir(fleet, hall, sizing, facility.limits_w, keep_inlets=keep)
         if fleet.models["thermal"] == "transient"
         else SteadyAir(fleet, hall, sizing, units, keep_inlets=keep)
     )

@@ -224,6 +224,8 @@ class Surroundings(SiteQuantities):
     """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
     pump_share: F64
     """Share of the chilled-water pumps that work, 0..1, (B,)."""
+    tank_share: F64
+    """Share of the buffer tank that is in use, 0..1, (B,)."""
     outdoor_units: F64
     """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
     no_unit_down: F64
@@ -276,6 +278,7 @@ class SurroundingsModel:
                 fully_powered=True,
                 chiller_share=self._ones,
                 pump_share=self._ones,
+                tank_share=self._ones,
                 outdoor_units=self._ones,
                 unit_running=self._unit_ones.copy(),
                 no_unit_down=self._ones,
@@ -297,6 +300,7 @@ class SurroundingsModel:
             fully_powered=bool(np.all(powered == 1.0)),
             chiller_share=event.chiller_share,
             pump_share=event.pump_share,
+            tank_share=event.tank_share,
             outdoor_units=event.outdoor_units,
             unit_running=unit_running,
             no_unit_down=self._units.lowest(unit_running),
