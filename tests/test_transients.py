@@ -591,7 +591,7 @@ def test_water_takes_up_the_heat_of_a_chiller_that_trips_and_returns_it() -> Non
     assert np.all(np.diff(inlet_c[20]) < -1.0)
     assert inlet_c[20, 3] < inlet_c[14, 3] + 0.1
     np.testing.assert_allclose(water_c[:15], water_c[[0]].repeat(15, axis=0), atol=1e-9)
-    assert np.all(water_c[20, [1, 2]] > water_c[0, [1, 2]] + 2.0)
+    assert np.all(water_c[20, [1, 2]] > water_c[0, [1, 2]] + 1.5)
     assert water_c[20, 3] == pytest.approx(water_c[0, 3], abs=1e-9)
     # Warm water fills the tank, and the loop warms only then.
     assert tank_kwh[:3].tolist() == [0.0, 0.0, 0.0]
@@ -651,9 +651,9 @@ def test_halls_with_water_equal_themselves_alone_and_after_a_saved_state() -> No
         sim.reset()
         sim.load_state_dict(saved)
         assert sim.step().inlet_max_c[0] == expected
+        old = {n: v for n, v in saved.items() if n != "tank_heat_j"} | {"version": np.array(3)}
         with pytest.raises(SdcError, match="snapshot: version 3, expected 4"):
-            old = {n: v for n, v in saved.items() if n != "tank_heat_j"}
-            sim.load_state_dict(old | {"version": np.array(3)})
+            sim.load_state_dict(old)
 
 
 def test_quasi_steady_halls_ignore_their_water_and_say_so() -> None:
