@@ -441,9 +441,11 @@ class RoomQuantities:
     """Heat that stays in the room, or is recovered from it, in one step."""
 
     unmet_w: Annotated[F64, Quantity("W")]
-    """Part of the cooling load that is not removed and stays in the room."""
+    """Part of the cooling load that the plant does not remove. It stays in the room or, in
+    transient halls, in the chilled water."""
     recovered_w: Annotated[F64, Quantity("W")]
-    """Heat stored in the room by earlier steps that spare cooling capacity removes."""
+    """Heat stored in room and chilled water by earlier steps that spare cooling capacity
+    removes."""
     room_heat_kwh: Annotated[F64, Quantity("kWh")]
     """Heat stored in the room at the end of the step, relative to the room at the setpoint; in
     transient halls with that in the chilled water and its tank."""
