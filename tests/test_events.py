@@ -82,6 +82,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         scheduled("crac_down", 6.0, 1.0),
         scheduled("pump_down", 7.0, 1.0, share=0.5),
         scheduled("tower_cell_down", 8.0, 1.0, share=0.75),
+        scheduled("tank_down", 9.0, 1.0, share=0.25),
     )
     line = timeline(
         data_center("a"),
@@ -91,7 +92,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         steps_per_hour=1,
     )
     assert not line.event_free
-    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True], [1.0, 1.0], [1.0, 1.0]]
+    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True], *[[1.0, 1.0]] * 3]
     expected = {
         1: (0, [True, True, True, True, False]),
         2: (1, [1.0, 0.4]),
@@ -100,7 +101,8 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         5: (4, [True, False]),
         6: (0, [True, True, True, False, False]),
         7: (5, [1.0, 0.5]),
-        8: (6, [1.0, 0.75]),
+        8: (7, [1.0, 0.75]),
+        9: (6, [1.0, 0.25]),
     }
     for step in range(11):
         wanted = list(normal)
