@@ -280,7 +280,10 @@ def _plan_store(plan: ti.template(), dc, peak_kwh):
                 drawn, delivered = _battery_step(
                     plan, dc, level, plan.commands[c], load_kwh, peak_kwh
                 )
-                rise = of_dc.charge_efficiency * drawn - of_dc.discharge_factor * delivered
+                rise = of_dc.charge_efficiency * (drawn - of_dc.square_per_kwh * drawn * drawn)
+                rise -= of_dc.discharge_factor * (
+                    delivered + of_dc.square_per_kwh * delivered * delivered
+                )
                 cost = _energy_cost(
                     plan, dc, plan.weight[dc, k], load_kwh + drawn - delivered, peak_kwh
                 )

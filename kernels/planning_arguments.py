@@ -37,8 +37,9 @@ QUEUE_ROWS = {
 """Queue inputs of each data center."""
 STORE_ROWS = {
     "spacing": "spacing of the levels of stored energy, in kWh",
-    "charge_efficiency": "energy stored per energy drawn",
-    "discharge_factor": "energy taken from the store per energy delivered",
+    "charge_efficiency": "energy stored per energy drawn, without the square loss",
+    "discharge_factor": "energy taken from the store per energy delivered, without the square loss",
+    "square_per_kwh": "loss divided by the square of the energy that is converted, 1/kWh",
     "grid_limit": "maximum energy of a step from the grid, in kWh",
     "end_value": "value of a stored kWh at the end of the forecast",
     "peak_kwh": "peak energy of a step of the month to date, in kWh",

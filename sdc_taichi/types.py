@@ -476,11 +476,11 @@ class BatteryQuantities:
     stored_kwh: Annotated[F64, Quantity("kWh")]
     """Energy in the battery at the end of the step."""
     charge_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy drawn from the grid into the battery."""
+    """Energy that the battery draws from the bus, with that of its standby."""
     discharge_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy delivered by the battery."""
+    """Energy that the battery delivers to the bus, less that of its standby."""
     battery_loss_kwh: Annotated[F64, Quantity("kWh")]
-    """Energy lost in the battery."""
+    """Energy lost in the battery and its inverter, with that of its standby."""
 
 
 @dataclass

@@ -26,6 +26,8 @@ class Run:
     counts_losses: bool
     flow_balance: F64
     """Of every watched step, (n, B)."""
+    battery_kwh: F64
+    """Capacity of the battery, (B,)."""
 
     def __getitem__(self, name: str) -> F64:
         return self.values[name]
@@ -72,6 +74,15 @@ def pump_heat_w(run: Run) -> F64:
     less than that, nothing is left for the hall."""
     heat_w = run.fleet_values("hvac.pumps.heat_to_water_share") * run["chilled_pump_w"]
     return np.asarray(np.minimum(heat_w, run["economiser_w"] + run["chiller_load_w"]))
+
+
+def converted_kwh(run: Run, sign: float) -> F64:
+    """Energy that the inverter draws (sign 1) or delivers (-1) less its square loss, (T, B)."""
+    standby_kwh = run.fleet_values("battery.standby_per_h") * run.battery_kwh * run.step_h
+    bus_kwh = run["charge_kwh"] - run["discharge_kwh"] - standby_kwh * run["grid_up"]
+    square_per_kwh = run.fleet_values("battery.square_loss_h") / (run.battery_kwh * run.step_h)
+    moved_kwh = np.maximum(sign * bus_kwh, 0.0)
+    return np.asarray(moved_kwh - sign * square_per_kwh * moved_kwh**2)
 
 
 def concentrating_l(run: Run) -> F64:
@@ -130,8 +141,8 @@ LEDGERS: dict[str, Ledger] = {
     ],
     "battery": lambda r: [
         r.before("stored_kwh"),
-        r.fleet_values("battery.charge_efficiency") * r["charge_kwh"],
-        -r.fleet_values("battery.discharge_factor") * r["discharge_kwh"],
+        r.fleet_values("battery.charge_efficiency") * converted_kwh(r, 1.0),
+        -r.fleet_values("battery.discharge_factor") * converted_kwh(r, -1.0),
         -r["stored_kwh"],
     ],
     "battery loss": lambda r: [

@@ -328,7 +328,7 @@ def test_the_battery_carries_an_outage_as_far_as_it_reaches() -> None:
     powered = column(results, "powered")
     assert np.all(np.diff(powered[out]) <= 0)
     assert powered[4] == 1.0 > powered[11]
-    facility = column(results, "it_kwh") + column(results, "hvac_kwh")
+    facility = column(results, "it_kwh") + column(results, "overhead_w") / 4e3
     np.testing.assert_allclose(facility[out], column(results, "discharge_kwh")[out], rtol=1e-9)
     assert column(results, "soc")[11] < 0.05
     executed = column(results, "executed_tasks")

@@ -97,7 +97,7 @@ def record(
     flows = []
     with Simulator(configs, precision=precision, drivers=drivers) as sim:
         state = sim.reset()
-        start = stocks(state)
+        start, battery_kwh = stocks(state), sim.sizing.battery_kwh
         for t in range(steps):
             result = sim.step(Actions(load[t], cooling[t], battery[t]))
             now = quantities(sim.fleet, result)
@@ -109,7 +109,16 @@ def record(
                 values[name][t] = value
     air = air_j_per_m3_k(sim.fleet)
     counts_losses = configs[0].electrical.losses == "counted"
-    return Run(values, start, sim.fleet.values, air, sim.step_h, counts_losses, np.array(flows))
+    return Run(
+        values,
+        start,
+        sim.fleet.values,
+        air,
+        sim.step_h,
+        counts_losses,
+        np.array(flows),
+        battery_kwh,
+    )
 
 
 def sites_and_seasons(

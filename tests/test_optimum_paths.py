@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, Work
 
 CLC = Storage("clc", 100.0, 20.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
+LOSSY = replace(CLC, square_loss_h=0.05, standby_per_h=0.01)
 RELEASED = Storage("released", 100.0, 20.0, 1.0, 1.0, 0.1, 1.0, -0.04, 1.0, 0.01, 0.0)
 
 
@@ -63,7 +65,7 @@ def test_load_commands_do_the_work_that_was_wanted(model: str) -> None:
     np.testing.assert_allclose(done.started_tasks[kept], wanted.started_tasks[kept], atol=1e-9)
 
 
-@pytest.mark.parametrize("storage", [CLC, RELEASED])
+@pytest.mark.parametrize("storage", [CLC, LOSSY, RELEASED])
 def test_battery_commands_draw_and_deliver_what_was_wanted(storage: Storage) -> None:
     n = 200
     rng = np.random.default_rng(1)

@@ -286,11 +286,16 @@ def test_nothing_to_move_costs_what_idle_commands_cost() -> None:
         np.testing.assert_allclose(plan(fixed).executed_tasks, p.work.arrived_tasks, atol=1e-9)
 
 
+@pytest.mark.parametrize("losses", [{}, {"square_loss_h": 0.1, "standby_per_h": 0.01}])
 @pytest.mark.parametrize("model", ["clc", "paper", "released"])
 @pytest.mark.parametrize("start_share", [0.0, 0.4, 1.0])
-def test_a_model_never_beats_the_limits_of_its_battery(model: str, start_share: float) -> None:
+def test_a_model_never_beats_the_limits_of_its_battery(
+    model: str, start_share: float, losses: dict[str, float]
+) -> None:
     rng = np.random.default_rng(5)
-    storage = replace(CLC, model=model, upper_v=0.9, lower_v=0.1)
+    storage = replace(CLC, model=model, upper_v=0.9, lower_v=0.1, **losses)
+    standby_kwh = storage.conversion(0.25).standby_kwh
+    assert standby_kwh == (0.25 if losses and model == "clc" else 0.0)
     limits = battery_limits(storage, 0.25, start_share * 100.0)
     stored, load = np.full(50, start_share * 100.0), 120.0
     parameters = storage_parameters(storage)._asdict()
@@ -299,18 +304,41 @@ def test_a_model_never_beats_the_limits_of_its_battery(model: str, start_share: 
         step = battery_step(
             model, stored, command, capacity_kwh=100.0, load_kw=load, dt_h=0.25, **parameters
         )
+        bus_kwh = step.charge_kwh - step.discharge_kwh - standby_kwh
+        charged, discharged = np.maximum(bus_kwh, 0.0), np.maximum(-bus_kwh, 0.0)
         for done, lines, most in (
-            (step.charge_kwh, limits.charge, limits.most_charge_kwh),
-            (step.discharge_kwh, limits.discharge, limits.most_discharge_kwh),
+            (charged, limits.charge, limits.most_charge_kwh),
+            (discharged, limits.discharge, limits.most_discharge_kwh),
         ):
             assert np.all(done <= most + 1e-9)
             for line, slope in lines:
                 assert np.all(done <= np.maximum(line + slope * stored, 0.0) + 1e-9)
-        assert np.all(step.discharge_kwh <= limits.discharge_load_share * load * 0.25 + 1e-9)
-        gain = limits.charge_efficiency * step.charge_kwh
-        gain = gain - limits.discharge_factor * step.discharge_kwh
+        most_kwh = limits.discharge_load_share * (load * 0.25 + standby_kwh)
+        assert np.all(discharged <= most_kwh + 1e-9)
+        gain = through_pieces(charged, limits.charge_pieces())
+        gain = gain - through_pieces(discharged, limits.discharge_pieces())
         assert np.all(step.stored_kwh - stored <= gain + limits.rounding_kwh + 1e-9)
         stored = step.stored_kwh
+
+
+def through_pieces(energy_kwh: F64, pieces: tuple[tuple[float, float], ...]) -> F64:
+    """Energy of the store for an energy of the bus that fills one piece after the other."""
+    ends_kwh = np.cumsum([0.0, *(most for most, _ in pieces)])
+    parts = np.diff(np.minimum(energy_kwh[:, None], ends_kwh), axis=1)
+    return np.asarray(parts @ np.array([ratio for _, ratio in pieces]))
+
+
+def test_square_losses_bend_the_pieces_of_a_battery() -> None:
+    storage = replace(CLC, square_loss_h=0.1)
+    limits, energy = battery_limits(storage, 0.25, 0.0), np.linspace(0.0, 12.0, 50)
+    converted, nothing = storage.conversion(0.25), np.zeros(50)
+    stored = through_pieces(energy, limits.charge_pieces())
+    exact = converted.rise_kwh(energy, nothing)
+    assert np.all((stored >= exact - 1e-12) & (stored < exact + 0.05))
+    taken = through_pieces(energy, limits.discharge_pieces())
+    exact = -converted.rise_kwh(nothing, energy)
+    assert np.all((taken <= exact + 1e-12) & (taken > exact - 0.2))
+    assert exact[-1] > 1.04 * 12.0 + 0.5
 
 
 def test_water_has_a_weight_of_its_own() -> None:

@@ -75,6 +75,26 @@ def test_racks_of_8_and_30_kw_warm_their_air_alike(mixed: Path) -> None:
         build_fleet(load_config(mixed, [alike, *equal]))
 
 
+@pytest.mark.filterwarnings("ignore::sdc_taichi.errors.OddInputWarning")
+@pytest.mark.parametrize("rack_kw", [60, 90, 132])
+def test_racks_beyond_what_air_cools_are_refused_unless_asked_for(rack_kw: int) -> None:
+    dense = [f"servers.power_w=[{rack_kw * 5}, 10]"]
+    with pytest.raises(
+        ConfigError, match=r"rack \d+ with servers of [\d.]+ kW needs .* m/s through its front"
+    ):
+        build_fleet(load_config("corrected", dense))
+    # A wider rack has a larger front, and warmer exhaust needs less air.
+    wide = ["hall.layout.rack_pitch_m=1.6"]
+    for asked in (["hall.most_face_velocity_m_s=7"], ["hall.most_face_velocity_m_s=null"], wide):
+        build_fleet(load_config("corrected", [*dense, *asked]))
+
+
+def test_densest_racks_of_air_cooled_servers_are_allowed() -> None:
+    """Four servers with eight accelerators, 14.3 kW each."""
+    servers = "{count: 4, full_w: 14300, idle_w: 3000, design_rise_k: 17, height_u: 10}"
+    build_fleet(load_config("hall_of_2026", [f"hall.rack_types.gpu_dense.servers={servers}"]))
+
+
 def test_odd_airflow_is_warned_of(mixed: Path) -> None:
     warm = load_config(mixed, ["hall.rack_types.gpu.servers.design_rise_k=28"])
     with pytest.warns(OddInputWarning, match=r"racks 16, 17 warm the air by 28 K .* 25 K is us"):

@@ -60,11 +60,19 @@ class BatteryConfig(Section):
     iron-air batteries, which discharge most slowly, reach 100 h."""
     initial_soc: Share = 0.0
     """State of charge after a reset, 0..1."""
-    charge_efficiency: WorkingShare = 0.97
-    """Energy stored divided by energy drawn from the bus, 0.01..1."""
-    discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.04
-    """Energy taken from the store divided by energy delivered to the bus, 1..100: from no loss to
-    an efficiency of 1 %."""
+    charge_efficiency: WorkingShare = 0.945
+    """Energy stored divided by energy drawn from the bus, without ``square_loss_h`` and standby,
+    0.01..1."""
+    discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.066
+    """Energy taken from the store divided by energy delivered to the bus, without ``square_loss_h``
+    and standby, 1..100: from no loss to an efficiency of 1 %."""
+    square_loss_h: Annotated[float, Field(ge=0, le=100)] = 0.02
+    """Loss of conversion that rises with the square of the power P, in h, 0..100, for model
+    ``clc``: the loss is ``square_loss_h`` P^2/capacity, so 0.02 means 2 % of the power at a rate of
+    1/h. It includes the resistance of the cells."""
+    standby_per_h: Annotated[float, Field(ge=0, le=1)] = 0.0015
+    """Power drawn from the bus at all times by inverter, transformer, cooling and controls, divided
+    by the capacity, in 1/h, 0..1, for model ``clc``; an outage of the grid ends it."""
     charge_limit_c_rate: CRate = 0.5
     """Largest rate at which the stored energy rises, in capacities per hour (1/h)."""
     discharge_limit_c_rate: CRate = 1.0
@@ -84,6 +92,14 @@ class BatteryConfig(Section):
     def _limits(self) -> Self:
         if self.lower_v >= self.upper_v:
             raise ValueError(f"lower_v {self.lower_v:g} must be below upper_v {self.upper_v:g}")
+        # At a higher power more energy would be lost than stored in addition.
+        most_h = self.charge_efficiency / (4.0 * self.charge_limit_c_rate)
+        if self.model == "clc" and self.square_loss_h > most_h:
+            raise ValueError(
+                f"square_loss_h {self.square_loss_h:g} with charge_limit_c_rate "
+                f"{self.charge_limit_c_rate:g}: no power reaches this rate; valid is at most "
+                f"{most_h:.3g} h, charge_efficiency / (4 charge_limit_c_rate)"
+            )
         return self
 
 

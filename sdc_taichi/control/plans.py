@@ -23,6 +23,8 @@ from sdc_taichi.plant.battery import (
     BATTERIES,
     BatteryParameters,
     BatteryPoint,
+    Conversion,
+    conversion,
 )
 from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
 from sdc_taichi.sim.facility import battery_parameters
@@ -350,18 +352,24 @@ class StorePlanner:
         self._kernel = PlanningKernel(store_kernel(), STORE_ARGUMENTS, STORE_LEVELS)
         self._first, self._later = first_commands(), np.array(COMMANDS)
         levels_kwh = sizing.battery_kwh[:, None] * np.linspace(0.0, 1.0, STORE_LEVELS)
-        charged = self._step(levels_kwh, 1.0, _AMPLE_KW)
-        ample, slight = (self._step(levels_kwh, -1.0, kw) for kw in (_AMPLE_KW, _SLIGHT_KW))
+        # Standby is a load beside that of the facility, which the kernel receives as such.
+        without = self._parameters._replace(standby_per_h=np.zeros((fleet.size, 1)))
+        charged = self._step(levels_kwh, 1.0, _AMPLE_KW, without)
+        ample, slight = (
+            self._step(levels_kwh, -1.0, kw, without) for kw in (_AMPLE_KW, _SLIGHT_KW)
+        )
         self._most = {
             "most_charge": charged.charge_kwh,
             "most_discharge": ample.discharge_kwh,
             "load_share": slight.discharge_kwh / (_SLIGHT_KW * step_h),
         }
-        self._charge_efficiency = _ratio(
-            charged.stored_kwh[:, 0] - levels_kwh[:, 0], charged.charge_kwh[:, 0]
-        )
-        self._discharge_factor = _ratio(
-            levels_kwh[:, -1] - ample.stored_kwh[:, -1], ample.discharge_kwh[:, -1]
+        self._conversion = Conversion(
+            *(
+                np.broadcast_to(np.asarray(values, np.float64).reshape(-1), fleet.size)
+                for values in conversion(
+                    fleet.models["battery"], self._parameters, sizing.battery_kwh[:, None], step_h
+                )
+            )
         )
 
     def plan(self, stored_kwh: F64, facility_kwh: F64, cost: EnergyCost, *, peaks: int) -> F64:
@@ -375,14 +383,22 @@ class StorePlanner:
         """
         size, horizon = facility_kwh.shape
         load_kw = facility_kwh[:, :1] / self._step_h
-        now = self._step(stored_kwh[:, None], self._first[None], load_kw, self._limit_kw[:, None])
+        now = self._step(
+            stored_kwh[:, None],
+            self._first[None],
+            load_kw,
+            self._parameters,
+            self._limit_kw[:, None],
+        )
+        converted = self._conversion
         capacity_kwh = np.where(self._capacity_kwh > 0, self._capacity_kwh, 1.0)
         of_dc = {
             "spacing": capacity_kwh / (STORE_LEVELS - 1),
-            "charge_efficiency": self._charge_efficiency,
-            "discharge_factor": self._discharge_factor,
+            "charge_efficiency": converted.charge_efficiency,
+            "discharge_factor": converted.discharge_factor,
+            "square_per_kwh": converted.square_per_kwh,
             "grid_limit": self._limit_kw * self._step_h,
-            "end_value": cost.weight.mean(axis=1) / self._discharge_factor,
+            "end_value": cost.weight.mean(axis=1) / converted.discharge_factor,
             "peak_kwh": cost.peak_kwh,
             "peak_cost": cost.peak_cost,
         }
@@ -391,7 +407,7 @@ class StorePlanner:
             horizon,
             commands=self._later,
             peaks=peaks,
-            facility_kwh=facility_kwh,
+            facility_kwh=facility_kwh + np.asarray(converted.standby_kwh)[:, None],
             of_dc=of_dc,
             weight=cost.weight,
             first_grid=now.grid_kwh,
@@ -401,7 +417,12 @@ class StorePlanner:
         return self._first[chosen]
 
     def _step(
-        self, stored_kwh: F64, command: F64 | float, load_kw: F64 | float, limit: F64 | None = None
+        self,
+        stored_kwh: F64,
+        command: F64 | float,
+        load_kw: F64 | float,
+        parameters: BatteryParameters,
+        limit: F64 | None = None,
     ) -> BatteryResult:
         """Step each battery from several stored energies or with several commands, (B, n)."""
         return self._model.step(
@@ -411,12 +432,7 @@ class StorePlanner:
                 capacity_kwh=self._capacity_kwh[:, None],
                 load_kw=load_kw,
                 dt_h=self._step_h,
-                parameters=self._parameters,
+                parameters=parameters,
                 grid_limit_kw=limit,
             ),
         )
-
-
-def _ratio(part: F64, whole: F64) -> F64:
-    """Return ``part`` / ``whole``, (B,), and 1 where ``whole`` is 0."""
-    return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0)

@@ -19,7 +19,9 @@ from pydantic import Field
 from sdc_taichi.errors import ConfigError, RuntimeStateError, suggestion
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.plant.battery import round_trip_efficiency
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -173,7 +175,8 @@ class Limits:
     setpoint_step_k: F64
     """Change of the setpoint by a cooling command of 1, in K, (B,)."""
     battery_round_trip: F64
-    """Battery round-trip efficiency: energy delivered divided by energy drawn, 0..1, (B,)."""
+    """Battery round-trip efficiency at full power: energy delivered divided by energy drawn, 0..1,
+    (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +306,7 @@ def limits_of(fleet: Fleet) -> Limits:
         setpoint_low_c=fleet.values("hvac.setpoint.min_c"),
         setpoint_high_c=fleet.values("hvac.setpoint.max_c"),
         setpoint_step_k=fleet.values("hvac.setpoint.step_k"),
-        battery_round_trip=fleet.values("battery.charge_efficiency")
-        / fleet.values("battery.discharge_factor"),
+        battery_round_trip=np.asarray(round_trip_efficiency(battery_parameters(fleet))),
     )
 
 

@@ -5,10 +5,14 @@ energy x, stored energy b, waiting work Q, and D, the total work deferred since 
 arriving work A, executed work e, and N steps to the deadline, the constraints (rows) are
 
     Q_t = Q_(t-1) + A_t - e_t - dropped_t        D_t - D_(t-1) <= min(most deferred, Q_t)
-    Q_t <= D_t - D_(t-N)                         b_t = b_(t-1) + eta_c*c_t - eta_d*x_t
+    Q_t <= D_t - D_(t-N)                         b_t <= b_(t-1) + eta_c(c_t) - eta_d(x_t)
     c_t, x_t <= the limits of ``BatteryLimits`` at b_(t-1)
-    x_t <= F_t(e_t)                              c_t + F_t(e_t) <= grid limit, largest F_t
-    F_t(e_t) + c_t - x_t <= step_h * peak of the month
+    x_t <= F_t(e_t) + S                          c_t + F_t(e_t) + S <= grid limit, largest F_t + S
+    F_t(e_t) + S + c_t - x_t <= step_h * peak of the month
+
+S is the standby energy of the battery. eta_c is a concave and eta_d a convex piecewise linear
+function: with a square loss, their pieces are tangents, so that they never store less and never
+take more than the battery. Without a square loss the row of b_t is an equation.
 
 Every sequence of commands in the simulator satisfies these rows, or costs at least as much as a
 sequence that does. Their optimum is therefore a bound, for three reasons:
@@ -121,14 +125,19 @@ class DispatchProgramme:
         self._steps = slice(span.first, span.end)
         self._programme = Programme()
         nothing = Linear(np.zeros(self._size))
-        self._base_cost = float(curves.base_cost[self._steps].sum())
+        self._converted = problem.storage.conversion(problem.step_h)
+        standby = nothing + float(self._converted.standby_kwh)
+        self._base_cost = float(
+            curves.base_cost[self._steps].sum() + problem.kwh_weight[self._steps] @ standby.constant
+        )
         self._executed, self._energy_kwh = self._add_segments(curves)
         self._queue, self._start_tasks = nothing, nothing[0]
         self._entered: Linear | None = None
         self._within_deadline = nothing
         if "load" in problem.agents:
             self._add_queue()
-        self._charge, self._discharge = nothing, nothing
+        # All charged energy includes standby, which a battery without a plan draws as well.
+        self._charge, self._discharge = standby, nothing
         self._stored = nothing + (span.start_kwh or 0.0)
         if self._has_battery:
             self._add_battery(stage)
@@ -287,8 +296,13 @@ class DispatchProgramme:
         storage, weight = problem.storage, problem.kwh_weight[self._steps]
         start = storage.stored_kwh if span.start_kwh is None else span.start_kwh
         limits = battery_limits(storage, problem.step_h, start)
-        charge = p.variables("charge", n, upper=limits.most_charge_kwh, cost=weight)
-        discharge = p.variables("discharge", n, upper=limits.most_discharge_kwh, cost=-weight)
+        charge = discharge = gain = Linear(np.zeros(n))
+        for k, (most_kwh, efficiency) in enumerate(limits.charge_pieces()):
+            piece = p.variables(f"charge_{k}", n, upper=most_kwh, cost=weight)
+            charge, gain = charge + piece, gain + efficiency * piece
+        for k, (most_kwh, factor) in enumerate(limits.discharge_pieces()):
+            piece = p.variables(f"discharge_{k}", n, upper=most_kwh, cost=-weight)
+            discharge, gain = discharge + piece, gain - factor * piece
         lower, capacity = np.zeros(n), storage.capacity_kwh
         if span.end_kwh is not None:
             lower[-1] = span.end_kwh
@@ -302,8 +316,9 @@ class DispatchProgramme:
             cost=self._start_value(tasks=False),
         )
         before = stored.before(start_kwh)
-        gain = limits.charge_efficiency * charge - limits.discharge_factor * discharge
-        p.equal("energy", stored - before - gain, limits.rounding_kwh)
+        # Pieces that are tangents store more than the battery, which may thus store less.
+        relate = p.equal if limits.square_per_kwh == 0.0 else p.at_most
+        relate("energy", stored - before - gain, limits.rounding_kwh)
         if span.as_after is not None:
             p.at_most("end_energy", stored[span.as_after - span.first], stored[-1])
         for name, energy, lines in (
@@ -316,11 +331,15 @@ class DispatchProgramme:
         spread = 0.0
         if problem.litre_weight:
             spread = (most_kwh[self._steps] - least_kwh).max(axis=1)
-        p.at_most("carried", discharge, limits.discharge_load_share * (self._energy_kwh + spread))
+        standby = float(self._converted.standby_kwh)
+        load = self._energy_kwh + spread + standby
+        p.at_most("carried", discharge, limits.discharge_load_share * load)
         if np.isfinite(problem.grid_limit_kw):
-            most = np.maximum(problem.grid_limit_kw * problem.step_h, least_kwh.max(axis=1))
-            p.at_most("grid", charge + self._energy_kwh, most)
-        self._charge, self._discharge, self._stored = charge, discharge, stored
+            least = least_kwh.max(axis=1) + standby
+            most = np.maximum(problem.grid_limit_kw * problem.step_h, least)
+            p.at_most("grid", charge + standby + self._energy_kwh, most)
+        self._charge, self._discharge, self._stored = charge + standby, discharge, stored
+        self._gain = gain
 
     def _add_peaks(self) -> None:
         """Add the highest power of each month, with its demand charge as cost."""
@@ -338,14 +357,12 @@ class DispatchProgramme:
 
     def _net_battery(self, solution: Solution) -> tuple[F64, F64]:
         """Return charge and discharge with the same stored energy, one of them 0 in each step."""
-        charge, discharge = solution.of(self._charge), solution.of(self._discharge)
         if not self._has_battery:
-            return charge, discharge
-        storage = self._problem.storage
-        limits = battery_limits(storage, self._problem.step_h, storage.stored_kwh)
-        eta_c, eta_d = limits.charge_efficiency, limits.discharge_factor
-        gain = eta_c * charge - eta_d * discharge
-        return np.maximum(gain, 0.0) / eta_c, np.maximum(-gain, 0.0) / eta_d
+            return solution.of(self._charge), solution.of(self._discharge)
+        gain, converted = solution.of(self._gain), self._converted
+        drawn_kwh = converted.drawn_kwh(np.maximum(gain, 0.0)) + converted.standby_kwh
+        bus_kwh = drawn_kwh - converted.delivered_kwh(np.maximum(-gain, 0.0))
+        return np.maximum(bus_kwh, 0.0), np.maximum(-bus_kwh, 0.0)
 
     def _values(self, *, tasks: bool) -> F64:
         """Return the cost per waiting task, or per stored kWh, at the end of each step, (n,)."""
@@ -370,6 +387,12 @@ def _peak_name(month: int) -> str:
 Line = tuple[float, float]
 """A linear limit in kWh: its value for an empty battery, and its slope per stored kWh."""
 
+Piece = tuple[float, float]
+"""A piece of an energy on the bus: its maximum in kWh, and kWh of the store per kWh."""
+
+_TANGENTS = 3
+"""Number of tangents that replace the square loss. The pieces store at most 1/16 of the square loss
+at full power more than the battery."""
 _STATES = 2001
 """Number of states of charge at which the ``released`` battery model is sampled."""
 _ROUNDING_KWH = 5e-6
@@ -401,6 +424,18 @@ class BatteryLimits:
     """Maximum ratio of the discharged energy to the energy of the facility."""
     rounding_kwh: float
     """Maximum energy that a step may gain by rounding, in kWh."""
+    square_per_kwh: float = 0.0
+    """Loss divided by the square of the energy that is converted, in 1/kWh."""
+
+    def charge_pieces(self) -> tuple[Piece, ...]:
+        """Return pieces of the charged energy, the piece that stores most per kWh first."""
+        ratio = self.charge_efficiency
+        return _pieces(self.most_charge_kwh, ratio, -ratio * self.square_per_kwh)
+
+    def discharge_pieces(self) -> tuple[Piece, ...]:
+        """Return pieces of the discharged energy, the piece that takes least per kWh first."""
+        ratio = self.discharge_factor
+        return _pieces(self.most_discharge_kwh, ratio, ratio * self.square_per_kwh)
 
 
 @lru_cache(maxsize=256)
@@ -429,16 +464,34 @@ def battery_limits(storage: Storage, step_h: float, start_kwh: float) -> Battery
     # The initial stored energy may be outside these limits until a command moves the battery.
     upper, lower = max(upper, start_kwh), min(lower, start_kwh)
     in_h, out_h = eta_c * step_h + rise_c, eta_d * step_h + rise_d
+    converted = storage.conversion(step_h)
+    linear_kwh = most_c * capacity * step_h
+    most_charge_kwh = float(converted.drawn_kwh(eta_c * linear_kwh))
+    most_discharge_kwh = float(converted.delivered_kwh(eta_d * most_d * capacity * step_h))
+    # The square loss raises the energy drawn for a rise of the store, at full power most.
+    raised = most_charge_kwh / linear_kwh if linear_kwh > 0 else 1.0
     return BatteryLimits(
         charge_efficiency=eta_c,
         discharge_factor=eta_d,
-        charge=((upper * step_h / in_h, -step_h / in_h),),
+        charge=((raised * upper * step_h / in_h, -raised * step_h / in_h),),
         discharge=((-lower * step_h / out_h, step_h / out_h),),
-        most_charge_kwh=most_c * capacity * step_h,
-        most_discharge_kwh=most_d * capacity * step_h,
+        most_charge_kwh=most_charge_kwh,
+        most_discharge_kwh=most_discharge_kwh,
         discharge_load_share=1.0,
         rounding_kwh=0.0,
+        square_per_kwh=float(converted.square_per_kwh),
     )
+
+
+def _pieces(most_kwh: float, ratio: float, square_per_kwh: float) -> tuple[Piece, ...]:
+    """Return the pieces of tangents of ratio*x + square_per_kwh*x^2 in 0 <= x <= most_kwh."""
+    if square_per_kwh == 0.0:
+        return ((most_kwh, ratio),)
+    at_kwh = np.linspace(0.0, most_kwh, _TANGENTS)
+    # Tangents of a parabola intersect halfway between the points that they touch.
+    ends_kwh = np.append((at_kwh[1:] + at_kwh[:-1]) / 2.0, most_kwh)
+    slopes = ratio + 2.0 * square_per_kwh * at_kwh
+    return tuple(zip(np.diff(ends_kwh, prepend=0.0).tolist(), slopes.tolist(), strict=True))
 
 
 def _released(capacity_kwh: float, step_h: float) -> BatteryLimits:

@@ -22,6 +22,7 @@ from sdc_taichi.plant.battery import (
     BATTERIES,
     BatteryParameters,
     BatteryPoint,
+    conversion,
 )
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, BatteryResult
@@ -146,11 +147,7 @@ def _stored_kwh(problem: Problem, facility_kwh: F64) -> F64:
     if storage.model == "released":
         return _released_kwh(problem, facility_kwh)
     battery = plan(replace(problem, agents=("battery",), table=_known_facility(facility_kwh)))
-    rise_kwh = (
-        storage.charge_efficiency * battery.charge_kwh
-        - storage.discharge_factor * battery.discharge_kwh
-    )
-    return np.clip(storage.stored_kwh + np.cumsum(rise_kwh), 0.0, storage.capacity_kwh)
+    return np.clip(battery.stored_kwh, 0.0, storage.capacity_kwh)
 
 
 def _known_facility(facility_kwh: F64) -> FacilityTable:
@@ -397,15 +394,10 @@ def _follow(
     fine = np.linspace(-1.0, 1.0, 4 * (len(COMMANDS) - 1) + 1)
     capacity = np.array([storage.capacity_kwh])
     parameters = BatteryParameters(*(np.array([x]) for x in storage_parameters(storage)))
+    converted = conversion(storage.model, parameters, capacity, step_h)
     for t, load_kwh in enumerate(facility_kwh):
-        to_end = bus_energy_kwh(
-            np.array([end_kwh]),
-            stored,
-            charge_efficiency=np.asarray(parameters.charge_efficiency),
-            discharge_factor=np.asarray(parameters.discharge_factor),
-        )
         exact = battery_command(
-            to_end,
+            bus_energy_kwh(np.array([end_kwh]), stored, converted),
             model=storage.model,
             stored_kwh=stored,
             load_kw=np.array([load_kwh / step_h]),

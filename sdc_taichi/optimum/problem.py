@@ -13,7 +13,7 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.tables import FacilityTable
-from sdc_taichi.plant.battery import BatteryParameters
+from sdc_taichi.plant.battery import BatteryParameters, Conversion, conversion
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
 from sdc_taichi.plant.workload import (
@@ -94,6 +94,20 @@ class Storage:
     """Slope of the minimum stored energy with respect to discharge power, in h (kWh per kW)."""
     lower_v: float
     """Minimum stored energy at zero discharge power, as a share of capacity."""
+    square_loss_h: float = 0.0
+    """Loss of conversion that rises with the square of the power, times the capacity and divided by
+    this square, in h."""
+    standby_per_h: float = 0.0
+    """Power drawn from the bus at all times, divided by the capacity, in 1/h."""
+
+    def conversion(self, step_h: float) -> Conversion:
+        """Return the conversion between bus and store in a step.
+
+        Args:
+            step_h: Length of a step, in h.
+        """
+        parameters = BatteryParameters(*(getattr(self, name) for name in BatteryParameters._fields))
+        return conversion(self.model, parameters, self.capacity_kwh, step_h)
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,7 +451,9 @@ def forced_discharge_reason(problem: Problem) -> str | None:
         The reason in words, or None if an idle battery never discharges.
     """
     table, limit_kw = problem.table, problem.grid_limit_kw
-    most_kw = float(np.where(table.unmet_w == 0.0, table.facility_kwh, 0.0).max()) / problem.step_h
+    most_kwh = float(np.where(table.unmet_w == 0.0, table.facility_kwh, 0.0).max())
+    standby_kwh = float(problem.storage.conversion(problem.step_h).standby_kwh)
+    most_kw = (most_kwh + standby_kwh) / problem.step_h
     if "battery" in problem.agents or problem.storage.stored_kwh <= 0 or most_kw <= limit_kw:
         return None
     return (

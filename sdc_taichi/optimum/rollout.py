@@ -15,7 +15,13 @@ from sdc_taichi.optimum.tables import (
     coolest_inlet_c,
     facility_kwh,
 )
-from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
+from sdc_taichi.plant.battery import (
+    BATTERIES,
+    BatteryParameters,
+    BatteryPoint,
+    Conversion,
+    conversion,
+)
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.plant.workload import RELEASED_QUEUE_TASKS, TASKS_PER_STEP, arriving_tasks
 from sdc_taichi.sim.drivers import Drivers
@@ -162,13 +168,10 @@ class Follower:
         self._work_model, self._battery_model = models["workload"], models["battery"]
         self._due_entries = due_entries(queue_length(fleet), due_steps(fleet))
         self._battery = battery_parameters(fleet)
-        loses = self._battery_model != "released"
-        one = np.ones(fleet.size)
-        self._efficiency = {
-            name: getattr(self._battery, name) if loses else one
-            for name in ("charge_efficiency", "discharge_factor")
-        }
         self._capacity_kwh = sizing.battery_kwh
+        self._converted = conversion(
+            self._battery_model, self._battery, self._capacity_kwh, self._step_h
+        )
         self._step_k = v("hvac.setpoint.step_k")[fleet.unit_dc]
         self._unit_dc = fleet.unit_dc
 
@@ -208,7 +211,7 @@ class Follower:
     def _battery_command(self, state: State) -> F64:
         target, stored = self._targets.stored_kwh[state.step], state.stored_kwh
         moves = ~np.isnan(target)
-        bus_kwh = bus_energy_kwh(np.where(moves, target, stored), stored, **self._efficiency)
+        bus_kwh = bus_energy_kwh(np.where(moves, target, stored), stored, self._converted)
         return battery_command(
             bus_kwh,
             model=self._battery_model,
@@ -316,7 +319,8 @@ def battery_command(
     If the energy is impossible, the command comes as close as it can.
 
     Args:
-        bus_kwh: energy that the battery draws from the bus, in kWh, (B,); negative if it delivers.
+        bus_kwh: energy that the battery draws from the bus, standby included, in kWh, (B,);
+            negative if it delivers.
         model: name of the battery model.
         stored_kwh: stored energy before the step, in kWh, (B,).
         load_kw: expected power of the facility, in kW, (B,).
@@ -325,19 +329,19 @@ def battery_command(
         parameters: efficiencies, rates and limits, (B,) each. The limit of the grid connection is
             ignored here; the simulator applies it.
     """
-    charges = bus_kwh >= 0
+    standby_kwh = conversion(model, parameters, capacity_kwh, step_h).standby_kwh
+    charges = bus_kwh >= standby_kwh
     full = BATTERIES[model].step(
         stored_kwh,
         np.where(charges, 1.0, -1.0),
         BatteryPoint(capacity_kwh, load_kw, step_h, parameters),
     )
-    share = _share(np.abs(bus_kwh), np.where(charges, full.charge_kwh, full.discharge_kwh))
+    full_kwh = full.charge_kwh - full.discharge_kwh - standby_kwh
+    share = _share(np.abs(bus_kwh - standby_kwh), np.abs(full_kwh))
     return np.where(charges, share, -share)
 
 
-def bus_energy_kwh(
-    target_kwh: F64, stored_kwh: F64, *, charge_efficiency: F64, discharge_factor: F64
-) -> F64:
+def bus_energy_kwh(target_kwh: F64, stored_kwh: F64, converted: Conversion) -> F64:
     """Return the energy that a battery must draw from the bus to store a target energy, kWh, (B,).
 
     The energy is negative if the battery must deliver.
@@ -345,11 +349,13 @@ def bus_energy_kwh(
     Args:
         target_kwh: target of the stored energy, in kWh, (B,).
         stored_kwh: stored energy, in kWh, (B,).
-        charge_efficiency: ratio of stored energy to energy drawn, (B,).
-        discharge_factor: ratio of energy taken from the store to energy delivered, (B,).
+        converted: conversion between bus and store in a step, (B,).
     """
     rise_kwh = target_kwh - stored_kwh
-    return np.where(rise_kwh >= 0, rise_kwh / charge_efficiency, rise_kwh / discharge_factor)
+    drawn_kwh = converted.drawn_kwh(np.maximum(rise_kwh, 0.0))
+    return np.asarray(
+        drawn_kwh - converted.delivered_kwh(np.maximum(-rise_kwh, 0.0)) + converted.standby_kwh
+    )
 
 
 def _share(part: F64, whole: F64) -> F64:

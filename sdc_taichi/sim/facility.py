@@ -20,7 +20,7 @@ from sdc_taichi.plant.battery import (
     BatteryPoint,
 )
 from sdc_taichi.plant.chiller import CHILLERS
-from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh
+from sdc_taichi.plant.electrical import NO_LIMIT_KW, ROUND_OFF_SHARE, overload_kwh
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterPoint
@@ -101,11 +101,18 @@ class Facility:
         self._grid_limit_kw = sizing.grid_limit_kw if limited else None
         self._outage_battery = self._battery
         if self._battery_model.by_rate_of_store:
-            # The discharge limit is relaxed by the loss factor, so that a one-hour battery at 1 C
+            # The discharge limit is relaxed by the losses, so that a one-hour battery at 1 C
             # delivers the design power. The error is small: the design power exceeds any load by
             # more than the losses.
-            rate = self._battery.discharge_limit_c_rate * self._battery.discharge_factor
-            self._outage_battery = self._battery._replace(discharge_limit_c_rate=rate)
+            rate = self._battery.discharge_limit_c_rate
+            linear_rate = rate * (1.0 + self._battery.square_loss_h * rate)
+            self._outage_battery = self._battery._replace(
+                # Rounding errors must not end the power of a step early.
+                discharge_limit_c_rate=(
+                    self._battery.discharge_factor * linear_rate * (1.0 + ROUND_OFF_SHARE)
+                ),
+                standby_per_h=0.0 * rate,
+            )
         self._water = {
             "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
             "drift_share": v("hvac.water.drift_share"),
@@ -349,14 +356,16 @@ class Facility:
         """
         ups_w, distribution_w = self._power_path_loss_w(inputs, it_w)
         overhead_w = hvac_w + (ups_w + distribution_w) if self._counts_losses else hvac_w
-        command = inputs.commands.battery_command
+        command, parameters = inputs.commands.battery_command, self._battery
         if not self._event_free:
-            command = np.where(inputs.surroundings.grid_up > 0, command, -1.0)
+            grid_up = inputs.surroundings.grid_up
+            command = np.where(grid_up > 0, command, -1.0)
+            parameters = parameters._replace(standby_per_h=parameters.standby_per_h * grid_up)
         battery = self._run_battery(
             inputs.state.stored_kwh,
             command,
             load_kw=(it_w + overhead_w) / 1e3,
-            parameters=self._battery,
+            parameters=parameters,
         )
         needed_kwh = battery.grid_kwh
         grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.surroundings.grid_up
