@@ -19,11 +19,11 @@ TASK_VALUE = 1e-4
 def made_up_optimum(
     sim: Simulator, steps: int, objective: str = "carbon", scored_from: int = 0
 ) -> Optimum:
-    """An optimum whose achieved path lowers the setpoint by 2 K and uses the battery once."""
+    """An optimum whose achieved path raises the setpoint by 2 K and uses the battery once."""
     aim = Objective.parse(objective)
     shape = (steps, sim.size)
     cooling, battery = np.zeros(shape), np.zeros(shape)
-    cooling[0] = -2.0
+    cooling[0] = 2.0
     battery[:8] = 1.0
     battery[60:] = -1.0
     idle = run_commands(sim, aim, np.zeros(shape), np.zeros(shape), scored_from)

@@ -273,7 +273,8 @@ def test_fleet_overview_fits_the_size(steps: pd.DataFrame, factor: float, power:
     unit = 1e3 if power == "kW" else 1e6
     highest = max(area.get_paths()[0].vertices[:, 1].max() for area in axes.collections)
     assert highest == pytest.approx((given["it_w"] + given["overhead_w"]).max() / unit)
-    np.testing.assert_allclose(pue.lines[0].get_ydata()[:-1], 1 + steps["hvac_w"] / steps["it_w"])
+    expected = 1 + steps["overhead_w"] / steps["it_w"]
+    np.testing.assert_allclose(pue.lines[0].get_ydata()[:-1], expected)
     assert carbon.get_ylabel() == f"emitted ({'kg' if power == 'kW' else 't'} CO₂e/h)"
     assert clock(inlets.get_xlim()[1]) == "03-02 00:00"
 
@@ -307,7 +308,7 @@ def test_overview_shows_the_run(steps: pd.DataFrame) -> None:
     def highest(axes: Any) -> float:
         return max(float(a.get_paths()[0].vertices[:, 1].max()) for a in axes.collections)
 
-    assert highest(power) == pytest.approx(((steps["it_w"] + steps["hvac_w"]) / 1e3).max())
+    assert highest(power) == pytest.approx(((steps["it_w"] + steps["overhead_w"]) / 1e3).max())
     assert highest(emitted) == pytest.approx(steps["carbon_g"].max() / 1e3 / 0.25)
     assert highest(charge) == pytest.approx(100 * steps["soc"].max())
     assert not power.lines

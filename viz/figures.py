@@ -215,17 +215,22 @@ def draw_temperatures(axes: Axes, steps: pd.DataFrame) -> None:
 
 
 def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
-    """Draw the power of each device, stacked, in kW."""
+    """Draw the power of each device, stacked, and of losses that count on top, in kW."""
     powers = [steps[column] / 1e3 for column in POWERS]
+    styles = [*POWERS.values()]
+    counted = (steps["it_w"] + steps["overhead_w"]) / 1e3
+    lost = counted - sum(powers)
+    if np.all(lost > 1e-6 * counted):
+        powers.append(lost)
+        styles.append(("UPS and distribution", GREY))
     axes.stackplot(
         step_edges(steps),
         [repeat_last(power) for power in powers],
-        labels=[name for name, _ in POWERS.values()],
-        colors=[colour for _, colour in POWERS.values()],
+        labels=[name for name, _ in styles],
+        colors=[colour for _, colour in styles],
         linewidth=0,
         step="post",
     )
-    counted = (steps["it_w"] + steps["overhead_w"]) / 1e3
     # A preset may exclude devices from the HVAC total; then the total is not the sum of devices.
     if not np.allclose(counted, sum(powers), rtol=1e-6):
         draw_steps(axes, steps, counted, color="black", linewidth=1.2, label="counted in total")

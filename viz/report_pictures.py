@@ -189,7 +189,7 @@ def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str
             "hot it became.",
         )
     )
-    if float(steps["charge_kwh"].max()) > 0 or float(steps["discharge_kwh"].max()) > 0:
+    if float(np.ptp(steps["soc"])) > 0:
         out.append(
             picture_element(
                 dashboards.battery_profile(steps, name),
@@ -359,15 +359,25 @@ def share_of(run: RunFolder, optimum: KnownOptimum) -> float | None:
         share = run.metrics["total"].get("achievable_share")
         return float(share) if is_number(share) else None
     total, best = run.metrics["total"], content["total"]
-    used = ("queue_end_tasks", "battery_charge_kwh", "battery_discharge_kwh")
     idle, achieved = best["idle"], best["achieved"]
-    ends_differ = any(total[name] != 0 for name in used)
+    ends_differ = total["queue_end_tasks"] != 0 or _uses_battery(run)
     if ends_differ or content["scored_from"] or not idle > achieved:
         return None
     figure = Objective.parse(content["objective"]).figure(
         **{name: total[name] for name in ("cfp_kg", "grid_kwh", "cost", "water_l")}
     )
     return float((idle - figure) / (idle - achieved))
+
+
+def _uses_battery(run: RunFolder) -> bool:
+    """Return True if a battery of a run has done more than to draw its standby."""
+    total, dcs = run.metrics["total"], range(len(run.names))
+    if total["battery_charge_kwh"] == 0 or total["battery_discharge_kwh"] > 0:
+        return bool(total["battery_discharge_kwh"] > 0)
+    return any(
+        bool(np.any(np.abs(steps["soc"] - config.battery.initial_soc) > 1e-9))
+        for steps, config in zip(read_steps(run, dcs, ["soc"]), read_configs(run, dcs), strict=True)
+    )
 
 
 def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:

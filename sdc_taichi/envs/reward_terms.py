@@ -40,8 +40,10 @@ import numpy as np
 
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.plant.battery import conversion
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.drivers import FleetSeries
+from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.types import F64, I64, StepResult
 from sdc_taichi.user_functions import is_replacement
 
@@ -85,6 +87,8 @@ class TermContext:
     """Facility energy of a step at the design point, in kWh."""
     task_kwh: F64
     """IT energy of a task, in kWh; it is 1 % of the IT energy of a step at full load."""
+    standby_kwh: F64
+    """Energy that the battery draws in a step in any case, but not in an outage, in kWh."""
     demand_charge_per_kw: F64
     """Price per kW of the highest power of a billing period."""
     bills: float
@@ -109,6 +113,15 @@ class TermContext:
         self._weight_of_step = _end_of_day_weight(np.arange(24 * per_hour), view.step_h)
         self.design_kwh = view.sizing.facility_w * view.step_h / 1e3
         self.task_kwh = view.sizing.it_w * view.step_h / (1e3 * TASKS_PER_STEP)
+        self.standby_kwh = np.broadcast_to(
+            conversion(
+                view.fleet.models["battery"],
+                battery_parameters(view.fleet),
+                view.sizing.battery_kwh,
+                view.step_h,
+            ).standby_kwh,
+            view.size,
+        ).copy()
         self.demand_charge_per_kw = view.fleet.values("tariff.demand_charge_per_kw")
 
     def begin_step(self, step: int, peak_kw: F64) -> None:
@@ -288,14 +301,14 @@ def work_carbon(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def cooling_carbon(r: StepResult, c: TermContext) -> F64:
-    """Carbon of the facility's energy minus the carbon of the executed tasks at full load."""
+    """Carbon of facility and battery standby minus that of the executed tasks at full load."""
     return -r.ci_g_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * CI_G_PER_KWH)
 
 
 @reward_term
 def battery_carbon(r: StepResult, c: TermContext) -> F64:
     """Carbon added by the battery; stored energy counts at the mean CI of the next 24 h."""
-    added_g = _stored_energy(r, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
+    added_g = _stored_energy(r, c, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
     return -added_g / (c.design_kwh * CI_G_PER_KWH)
 
 
@@ -308,14 +321,14 @@ def work_cost(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def cooling_cost(r: StepResult, c: TermContext) -> F64:
-    """Cost of the facility's energy minus the cost of the executed tasks, in units of `cost`."""
+    """Cost of facility and battery standby minus that of the executed tasks, in units of `cost`."""
     return -r.price_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * PRICE_PER_KWH)
 
 
 @reward_term
 def battery_cost(r: StepResult, c: TermContext) -> F64:
     """Cost added by the battery, analogous to `battery_carbon`, in units of `cost`."""
-    added = _stored_energy(r, r.price_per_kwh, c.coming_price_before, c.coming_price)
+    added = _stored_energy(r, c, r.price_per_kwh, c.coming_price_before, c.coming_price)
     return -added / (c.design_kwh * PRICE_PER_KWH)
 
 
@@ -336,23 +349,27 @@ def _moved_work(r: StepResult, c: TermContext, rate: F64, before: F64, after: F6
     return c.task_kwh * (rise - rate * longer_tasks)
 
 
-def _stored_energy(r: StepResult, rate: F64, before: F64, after: F64) -> F64:
+def _stored_energy(r: StepResult, c: TermContext, rate: F64, before: F64, after: F64) -> F64:
     """Compute the carbon or cost added by the battery, (B,), in the unit of ``rate`` times kWh.
+
+    Standby is left out, because no command changes it.
 
     Args:
         r: result of the step.
+        c: context of the step.
         rate: carbon intensity or price in the step, per kWh, (B,).
         before: rate that values stored energy at the beginning of the step, (B,).
         after: rate that values stored energy at the end of the step, (B,).
     """
-    drawn_kwh = r.charge_kwh - r.discharge_kwh
-    gained_kwh = drawn_kwh - r.battery_loss_kwh
+    standby_kwh = c.standby_kwh * r.grid_up
+    drawn_kwh = r.charge_kwh - r.discharge_kwh - standby_kwh
+    gained_kwh = drawn_kwh - (r.battery_loss_kwh - standby_kwh)
     return rate * drawn_kwh - (after * r.stored_kwh - before * (r.stored_kwh - gained_kwh))
 
 
 def _beyond_work_kwh(r: StepResult, c: TermContext) -> F64:
-    """Return the facility's energy minus that of its executed tasks at full load, in kWh, (B,)."""
-    return r.facility_kwh - c.task_kwh * r.executed_tasks
+    """Return energy of facility and standby minus that of the executed tasks, in kWh, (B,)."""
+    return r.facility_kwh + c.standby_kwh * r.grid_up - c.task_kwh * r.executed_tasks
 
 
 def terms_markdown() -> str:

@@ -297,11 +297,11 @@ class DispatchProgramme:
         start = storage.stored_kwh if span.start_kwh is None else span.start_kwh
         limits = battery_limits(storage, problem.step_h, start)
         charge = discharge = gain = Linear(np.zeros(n))
-        for k, (most_kwh, efficiency) in enumerate(limits.charge_pieces()):
-            piece = p.variables(f"charge_{k}", n, upper=most_kwh, cost=weight)
+        for k, (piece_kwh, efficiency) in enumerate(limits.charge_pieces()):
+            piece = p.variables(f"charge_{k}", n, upper=piece_kwh, cost=weight)
             charge, gain = charge + piece, gain + efficiency * piece
-        for k, (most_kwh, factor) in enumerate(limits.discharge_pieces()):
-            piece = p.variables(f"discharge_{k}", n, upper=most_kwh, cost=-weight)
+        for k, (piece_kwh, factor) in enumerate(limits.discharge_pieces()):
+            piece = p.variables(f"discharge_{k}", n, upper=piece_kwh, cost=-weight)
             discharge, gain = discharge + piece, gain - factor * piece
         lower, capacity = np.zeros(n), storage.capacity_kwh
         if span.end_kwh is not None:

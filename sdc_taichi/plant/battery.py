@@ -90,7 +90,7 @@ class Conversion(NamedTuple):
     standby_kwh: Values = 0.0
     """Energy drawn from the bus beside the energy that is converted, in kWh, (B,)."""
 
-    def rise_kwh(self, drawn_kwh: Values, delivered_kwh: Values) -> F64:
+    def rise_kwh(self, drawn_kwh: Values, delivered_kwh: Values) -> Values:
         """Return the rise of the stored energy, in kWh, (B,).
 
         Args:
