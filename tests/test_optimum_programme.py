@@ -336,7 +336,7 @@ def test_square_losses_bend_the_pieces_of_a_battery() -> None:
     exact = converted.rise_kwh(energy, nothing)
     assert np.all((stored >= exact - 1e-12) & (stored < exact + 0.05))
     taken = through_pieces(energy, limits.discharge_pieces())
-    exact = -converted.rise_kwh(nothing, energy)
+    exact = np.asarray(-converted.rise_kwh(nothing, energy))
     assert np.all((taken <= exact + 1e-12) & (taken > exact - 0.2))
     assert exact[-1] > 1.04 * 12.0 + 0.5
 
