@@ -15,15 +15,24 @@ from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, 
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.plant import moist_air, plants
-from sdc_taichi.plant.chiller import CHILLERS
-from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint, fits
-from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.plant.chiller import CHILLERS, ChillerPoint
+from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint, fits, water_cooled
+from sdc_taichi.plant.tower import TOWERS, TowerPoint
+from sdc_taichi.plant.water_side import (
+    WaterSideDesign,
+    chilled_water_c,
+    chilled_water_load_w,
+    coil_capacity_w,
+    economiser_share,
+    loop_pump_w,
+)
+from sdc_taichi.sim.drivers import load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.sizing import Sizing
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, WaterSideResult
 from test_ledgers import assert_closes, record, sites_and_seasons
 
+SETPOINTS = ["reset", "approach"]
 WATER_COOLED = ["centrifugal_vsd", "carnot", "eir_york", "electric_water_cooled", "constant_cop"]
 
 
@@ -287,15 +296,17 @@ def test_plants_do_with_the_devices_that_are_left(plant: str, kind: str) -> None
         assert np.all(result.rejected_w >= result.heat_removed_w), share
     if kind == "pump_down":
         load_w = runs[0.5][0].cooling_load_w
-        hot = load_w[0] - 0.5 * design.cooling_w[0]
-        assert unmet[0.5][0] == pytest.approx(hot, rel=1e-9)
+        # Half of the water warms up by more than half again, but not by twice as much.
+        removed_w = load_w[0] - unmet[0.5][0]
+        assert 0.55 * design.cooling_w[0] < removed_w < 0.85 * design.cooling_w[0]
         # Outdoor air needs no water.
         assert unmet[0.0][1] == pytest.approx(0.0 if plant == "air_side" else load_w[1])
     elif kind == "tower_cell_down":
-        at_half = runs[0.5][0]
-        np.testing.assert_allclose(at_half.heat_removed_w, 0.5 * design.cooling_w)
-        np.testing.assert_allclose(runs[0.0][0].unmet_w, runs[0.0][0].cooling_load_w)
-        assert at_half.condenser_water_c[0] < runs[1.0][0].condenser_water_c[0] + 5.0
+        np.testing.assert_array_equal(unmet[0.5], 0.0)
+        np.testing.assert_allclose(unmet[0.0], runs[0.0][0].cooling_load_w)
+        warmer_k = runs[0.5][0].condenser_water_c[0] - runs[1.0][0].condenser_water_c[0]
+        assert 1.0 < warmer_k < 6.0
+        assert runs[0.5][0].chiller_w[0] > runs[1.0][0].chiller_w[0]
     else:
         # Free cooling falls, and the chiller makes up for it.
         np.testing.assert_array_equal([*unmet[0.5], *unmet[0.0]], 0.0)
@@ -307,16 +318,16 @@ def test_plants_do_with_the_devices_that_are_left(plant: str, kind: str) -> None
 # Continuity, and free cooling that never costs more than it saves
 
 SWEPT = [
-    *(("water_cooled", name, "yorkcalc") for name in WATER_COOLED),
+    *(("water_cooled", name, setpoint) for name in WATER_COOLED for setpoint in SETPOINTS),
     *(
-        (plant, name, "yorkcalc")
+        (plant, name, "approach")
         for plant, model in PLANTS.items()
         for name, chiller in CHILLERS.items()
         if model.dry and fits(chiller, model)
     ),
 ]
-"""Plants, chillers and towers, but for those of presets sustaindc and paper, which keep the jumps
-of their sources."""
+"""Plants, chillers and setpoints of the tower, but for the models of presets sustaindc and paper,
+which keep the jumps of their sources."""
 STEP_K, STEP_LOAD, LARGEST_JUMP = 0.002, 2e-4, 0.005
 LARGEST_JUMP_OF_DAMPERS = 0.015
 """Where dampers close for humid air: without their band, power would jump to several times."""
@@ -346,10 +357,10 @@ STARTS = [
 
 
 @cache
-def sized(plant: str, chiller: str, tower: str) -> Sizing:
+def sized(plant: str, chiller: str, setpoint: str) -> Sizing:
     overrides = [f"hvac.plant={plant}", f"hvac.chiller.model={chiller}",
-                 f"hvac.tower.model={tower}", "hvac.setpoint.min_c=14", "hvac.setpoint.max_c=27",
-                 *TUCSON]  # fmt: skip
+                 f"hvac.tower.setpoint={setpoint}", "hvac.setpoint.min_c=14",
+                 "hvac.setpoint.max_c=27", *TUCSON]  # fmt: skip
     if chiller == "eir_york":
         overrides.append("hvac.chiller.coil_approach_k=9")
     drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
@@ -358,7 +369,8 @@ def sized(plant: str, chiller: str, tower: str) -> Sizing:
 
 
 def hvac_w(names: tuple[str, str, str], at: Swept, *, free: bool = True) -> F64:
-    """Power of the plant and of CRAC fans that follow the load, of the shape of what is swept."""
+    """Power of the plant and of CRAC fans that follow the load, of the shape of what is swept; nan
+    where the plant does not remove all heat."""
     sizing = sized(*names)
     design = sizing.water_side
     load, setpoint_c, outdoor_c, depression_k = np.broadcast_arrays(*at)
@@ -378,10 +390,11 @@ def hvac_w(names: tuple[str, str, str], at: Swept, *, free: bool = True) -> F64:
             wet_bulb_c=outdoor_c - depression_k,
         ),
         design,
-        Devices(CHILLERS[names[1]], TOWERS[names[2]], limited=True),
+        Devices(CHILLERS[names[1]], TOWERS["yorkcalc"], limited=True, reset=names[2] == "reset"),
     )
     pumps_w = plant.chilled_pump_w + plant.condenser_pump_w
-    return np.asarray(plant.chiller_w + plant.tower_fan_w + pumps_w + sizing.crac_fan_w * speed**3)
+    power_w = plant.chiller_w + plant.tower_fan_w + pumps_w + sizing.crac_fan_w * speed**3
+    return np.where(plant.heat_removed_w >= load_w * (1.0 - 1e-9), power_w, np.nan)
 
 
 def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
@@ -393,14 +406,7 @@ def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
     return (names[0] == "air_side") & (share > 0.0) & (share < 1.0)
 
 
-def waiting(names: tuple[str, str, str]) -> list[pytest.MarkDecorator]:
-    reason = "the setpoint of the tower switches where the economiser starts"
-    return [pytest.mark.xfail(reason=reason, strict=True)] if names[0] == "water_cooled" else []
-
-
-@pytest.mark.parametrize(
-    "names", [pytest.param(n, id="-".join(n), marks=waiting(n)) for n in SWEPT]
-)
+@pytest.mark.parametrize("names", SWEPT, ids="-".join)
 def test_power_of_plants_has_no_jumps(names: tuple[str, str, str]) -> None:
     jumps = []
     for sweep, (field, values) in SWEEPS.items():
@@ -410,32 +416,244 @@ def test_power_of_plants_has_no_jumps(names: tuple[str, str, str]) -> None:
             steps = np.abs(np.diff(power_w)) / power_w[1:]
             over = steps - np.where(dampers_move(names, at)[1:], LARGEST_JUMP_OF_DAMPERS,
                                     LARGEST_JUMP)  # fmt: skip
-            if over.max() > 0.0:
-                i = int(over.argmax())
+            if np.nanmax(over, initial=0.0) > 0.0:
+                i = int(np.nanargmax(over))
                 jumps.append(f"{sweep} {values[i]:.4f}, {start}: {steps[i]:.2%} of HVAC")
     assert not jumps, "\n".join(jumps)
 
 
-@pytest.mark.parametrize(
-    "names", [pytest.param(n, id="-".join(n), marks=waiting(n)) for n in SWEPT]
-)
+@pytest.mark.parametrize("names", SWEPT, ids="-".join)
 def test_free_cooling_never_costs_more_than_none(names: tuple[str, str, str]) -> None:
     more = []
     for sweep, (field, values) in SWEEPS.items():
         for start in STARTS:
             at = start._replace(**{field: values[::25]})
             ratio = hvac_w(names, at) / hvac_w(names, at, free=False) - 1.0
-            if ratio.max() > 1e-9:
-                i = int(ratio.argmax())
+            if np.nanmax(ratio, initial=0.0) > 1e-9:
+                i = int(np.nanargmax(ratio))
                 more.append(f"{sweep} {values[25 * i]:.3f}, {start}: {ratio[i]:+.2%}")
     assert not more, "\n".join(more)
+
+
+@cache
+def sized_plant(*overrides: str) -> tuple[WaterSideDesign, Devices]:
+    """Sizes of a data center for 25.6 C wet bulb and 33 C dry bulb, and the models of its plant."""
+    design_day = ["hvac.sizing.design_wet_bulb_c=25.6", "hvac.sizing.design_outdoor_c=33"]
+    config = load_config("corrected", [*design_day, *overrides])
+    with Simulator(config, drivers=drivers_from_arrays([20.0], [15.0], [300.0], [0.5])) as sim:
+        sim.reset()
+        hvac = config.hvac
+        models = CHILLERS[hvac.chiller.model], TOWERS[hvac.tower.model]
+        return sim.sizing.water_side, Devices(*models, limited=True, reset=hvac.tower.resets)
+
+
+def stepped(
+    sized: tuple[WaterSideDesign, Devices], load: Any, setpoint_c: Any, wet_bulb_c: Any
+) -> WaterSideResult:
+    """A step of a water-cooled plant; the load is a share of the capacity of the coils."""
+    design, devices = sized
+    load, setpoint_c, wet_bulb_c, one = np.broadcast_arrays(load, setpoint_c, wet_bulb_c, [1.0])
+    point = PlantPoint(setpoint_c, setpoint_c, setpoint_c + 12.0, one, wet_bulb_c + 6.0, wet_bulb_c)
+    return water_cooled(load * design.cooling_w, point, design, devices)
+
+
+def power_w(result: WaterSideResult) -> F64:
+    """Power of the plant, in W, (B,)."""
+    pumps_w = result.chilled_pump_w + result.condenser_pump_w
+    return result.chiller_w + result.tower_fan_w + pumps_w
+
+
+def merkel_number(
+    wet_bulb_c: float, range_k: float, approach_k: float, water_per_air: float
+) -> float:
+    """Integral of Merkel for a tower in counterflow, at some kg of water per kg of air."""
+
+    def enthalpy(c: F64) -> F64:
+        """Enthalpy of saturated air, J/kg, with the formula of Magnus for the vapour."""
+        vapour_pa = 611.2 * np.exp(17.62 * c / (243.12 + c))
+        ratio = 0.622 * vapour_pa / (101_325.0 - vapour_pa)
+        return np.asarray(1006.0 * c + ratio * (2.501e6 + 1860.0 * c))
+
+    cold_c = wet_bulb_c + approach_k
+    water_c = cold_c + range_k * (np.arange(200) + 0.5) / 200
+    air = enthalpy(np.array([wet_bulb_c])) + water_per_air * 4184.0 * (water_c - cold_c)
+    gap = enthalpy(water_c) - air
+    return float(4184.0 * range_k * np.mean(1.0 / gap)) if gap.min() > 0 else np.inf
+
+
+@pytest.mark.parametrize("wet_bulb_c", [22.0, 25.6])
+@pytest.mark.parametrize(("load", "cells"), [(0.6, 0.5), (0.85, 0.5), (0.85, 0.75), (0.5, 0.3)])
+def test_cells_that_are_left_cool_all_water_as_far_as_merkel_says(
+    load: float, cells: float, wet_bulb_c: float
+) -> None:
+    # Setpoints near the wet bulb keep the fans at full speed.
+    design, devices = sized_plant("hvac.tower.economiser=false", "hvac.tower.setpoint=approach")
+    left = replace(design, outdoor_units=np.array([cells]))
+    result = stepped((left, devices), load, 23.0, wet_bulb_c)
+    assert result.heat_removed_w == pytest.approx(load * design.cooling_w)
+    flow = float(result.tower_water_kg_s[0] / design.tower_water_kg_s[0]) / cells
+    # The fill at design; its transfer number falls with the water, KaV/L ~ (L/G)^-0.5.
+    wanted = merkel_number(25.6, 5.56, 4.0, 1.4) * flow**-0.5
+    grid = np.linspace(0.5, 25.0, 2451)
+    numbers = [merkel_number(wet_bulb_c, result.tower_range_k[0], k, 1.4 * flow) for k in grid]
+    approach_k = grid[np.argmax(np.array(numbers) < wanted)]
+    assert result.condenser_water_c[0] - wet_bulb_c == pytest.approx(approach_k, abs=0.6)
+
+
+@pytest.mark.parametrize("chiller", WATER_COOLED)
+def test_chiller_unloads_to_what_few_cells_reject(chiller: str) -> None:
+    design, devices = sized_plant(f"hvac.chiller.model={chiller}")
+    cells = np.array([0.0, 0.002, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0])
+    few = replace(design, outdoor_units=cells)
+    result = stepped((few, devices), 0.87, 18.0, 25.6)
+    removed = result.heat_removed_w / design.cooling_w
+    assert removed[0] == pytest.approx(0.0, abs=0.005)
+    assert np.all(np.diff(removed) >= -1e-9)
+    assert np.all(removed[1:] >= np.minimum(cells[1:], 0.87) - 0.003)
+    assert removed[-1] == pytest.approx(0.87)
+    limited = removed[1:] < 0.86
+    hottest_c = result.condenser_water_c[1:][limited]
+    assert limited.any()
+    assert np.all(hottest_c[1:] < design.max_condenser_c[0] + 2.5)
+    np.testing.assert_allclose(hottest_c[1:3], design.max_condenser_c[0], atol=2.5)
+    np.testing.assert_allclose(
+        result.rejected_w, 4184.0 * result.tower_water_kg_s * result.tower_range_k, atol=1.0
+    )
+
+
+def test_warm_condenser_water_takes_capacity_of_the_default_chiller() -> None:
+    # Trane CVHE 1442 kW with variable speed (Modelica Buildings, Data.ElectricEIR): capacity
+    # divided by that at 6.67 and 29.44 C.
+    published = {(6.67, 31.0): 0.939, (6.67, 33.0): 0.847, (6.67, 35.0): 0.740,
+                 (4.44, 29.44): 0.896, (4.44, 33.0): 0.731, (8.89, 35.0): 0.863}  # fmt: skip
+    for (chilled_c, condenser_c), share in published.items():
+        machine = chiller_step(
+            "centrifugal_vsd",
+            2.0,
+            reference_w=1.0,
+            chilled_water_c=chilled_c,
+            condenser_c=condenser_c,
+            outdoor_c=30.0,
+            reference_cop=5.96,
+        )
+        assert machine.available_w == pytest.approx(share, abs=0.03)
+        assert machine.unmet_w == pytest.approx(2.0 - share, abs=0.03)
+
+
+def test_coils_warm_little_water_more() -> None:
+    """A coil in counterflow with the resistances of the design point, against its formula."""
+    design, _ = sized_plant()
+    air_k, water_k = float(design.coil_rise_k[0]), float(design.chilled_water_range_k[0])
+    entering_k = air_k + float(design.coil_approach_k[0])
+
+    def heat(flow: float, conductance: float) -> float:
+        """Heat by the kelvin of the design's entering difference, in units of the design heat."""
+        small, large = sorted([flow / water_k, 1.0 / air_k])
+        ratio, units = small / large, conductance / small
+        gone = np.exp(-units * (1.0 - ratio))
+        return entering_k * small * (1.0 - gone) / (1.0 - ratio * gone)
+
+    conductance = np.linspace(0.01, 2.0, 20_000)
+    at_design = conductance[np.argmin([abs(heat(1.0, c) - 1.0) for c in conductance])]
+    for flow in (0.3, 0.5, 0.75, 1.0):
+        film = at_design / (0.5 + 0.5 * flow**-0.75)
+        few = replace(design, pumped_w=flow * design.cooling_w)
+        capacity = coil_capacity_w(few) / design.cooling_w
+        assert capacity == pytest.approx(heat(flow, film), rel=0.05)
+        _, pump_w, range_ratio = chilled_water_load_w(
+            capacity * design.cooling_w, few, limited=True
+        )
+        assert range_ratio == pytest.approx(capacity / flow, rel=1e-9)
+        assert pump_w == pytest.approx(design.chilled_pump_w * max(flow, 0.6) ** 3)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+def test_dry_coolers_that_are_left_receive_all_water(share: float) -> None:
+    event = "events.scheduled=[{kind: dry_cooler_down, start_h: 0, duration_h: 1, share: %g}]"
+    weather = [7.0], [3.0]
+    result, design = steady([*DRY["air_cooled"], event % share], *weather)
+    over_k = (
+        float(result.chilled_water_c[0])
+        + 6.0 * (result.heat_removed_w[0] / design.cooling_w[0]) ** -0.25
+        - 7.0
+    )
+    full_w = (design.cooling_w + 0.9 * design.chilled_pump_w)[0] * over_k / 14.0
+    # Coolers in counterflow whose capacity flows of air and water are equal at design: the
+    # effectiveness of 6/14 is N/(1 + N), with N = 0.75 transfer units. The water of those that are
+    # left flows 1/share times as fast, and each kilogram has N share of them.
+    gone = np.exp(-0.75 * share * (1.0 - 1.0 / share))
+    effectiveness = (1.0 - gone) / (1.0 - gone / share)
+    assert result.economiser_w[0] / full_w == pytest.approx(effectiveness / (6.0 / 14.0), rel=0.05)
+    assert result.economiser_w[0] / full_w > share
+
+
+# Free cooling and the reset of the condenser water
+
+
+@pytest.mark.parametrize("load", [0.1, 0.35, 0.6, 0.87])
+def test_reset_draws_no_more_as_it_gets_cooler(load: float) -> None:
+    for setpoint_c in (16.0, 18.0, 23.0):
+        drawn_w = power_w(stepped(sized_plant(), load, setpoint_c, np.arange(-25.0, 25.6, 0.02)))
+        assert np.all(np.diff(drawn_w) >= -1e-4 * drawn_w[1:])
+
+
+def least_power_w(
+    sized: tuple[WaterSideDesign, Devices], load: float, setpoint_c: float, wet_bulb_c: F64
+) -> F64:
+    """Least power of the plant over all temperatures of the tower water, in W, (B,)."""
+    design, devices = sized
+    taken_w, pump_w, range_ratio = chilled_water_load_w(
+        load * design.cooling_w, design, limited=True
+    )
+    chilled_c = chilled_water_c(np.array([setpoint_c]), design)
+    return_c = chilled_c + design.chilled_water_range_k * range_ratio
+    least_w = np.full(len(wet_bulb_c), np.inf)
+    for water_c in np.arange(-10.0, 45.0, 0.2):
+        share = design.economiser * economiser_share(
+            return_c,
+            chilled_water_c=chilled_c,
+            tower_water_c=water_c + design.exchanger_approach_k,
+        )
+        condenser_c = np.maximum(water_c, design.min_condenser_c)
+        at = ChillerPoint(design.chiller_w, chilled_c, condenser_c, condenser_c, design.machine)
+        machine = devices.chiller.step(taken_w * (1.0 - share), at)
+        heat_w = taken_w * share + machine.rejected_w
+        flow = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
+        tower = devices.tower.step(
+            heat_w,
+            TowerPoint(wet_bulb_c, wet_bulb_c + 6.0, np.array([water_c]), chilled_c,
+                       flow * design.tower_water_kg_s, design.tower_reference_kg_s,
+                       design.tower_air_m3s, design.tower_fan_w, design.air_j_per_m3_k),
+        )  # fmt: skip
+        reached = (tower.leaving_c <= water_c + 1e-9) & (machine.unmet_w <= 0.0)
+        condenser_pump_w = loop_pump_w(heat_w, design.rejected_w, design.condenser_pump_w, design)
+        drawn_w = machine.power_w + tower.fan_w + pump_w + condenser_pump_w
+        least_w = np.minimum(least_w, np.where(reached, drawn_w, np.inf))
+    return least_w
+
+
+@pytest.mark.parametrize("site", ["AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA"])
+def test_reset_is_near_the_best_of_each_hour(site: str) -> None:
+    drivers = load_drivers([load_config("corrected", [f"site.location={site}"])])
+    wet_bulb_c = np.sort(np.ravel(drivers.wet_bulb_c.values))[::173]
+    sized = sized_plant(f"hvac.sizing.design_wet_bulb_c={drivers.design_wet_bulb_c[0]}")
+    losses = []
+    for load in (0.3, 0.6, 0.8):
+        for setpoint_c in (18.0, 23.0):
+            least_w = least_power_w(sized, load, setpoint_c, wet_bulb_c)
+            drawn_w = power_w(stepped(sized, load, setpoint_c, wet_bulb_c))
+            reachable = np.isfinite(least_w)
+            assert np.mean(reachable) > 0.98
+            losses.append(np.sum(drawn_w[reachable]) / np.sum(least_w[reachable]) - 1.0)
+    assert np.mean(losses) < 0.01
+    assert np.max(losses) < 0.0125
 
 
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
 @pytest.mark.parametrize("plant", DRY)
 def test_ledgers_of_dry_plants_close_on_every_step(plant: str, thermal: str) -> None:
     overrides = [*DRY[plant], f"simulation.thermal={thermal}", "events.sampled=[{kind: pump_down, "
-                 "per_year: 200, duration_h: [1, 6], share: 0.3}]"]  # fmt: skip
+                 "per_year: 200, duration_h: [1, 6], share: 0.1}]"]  # fmt: skip
     configs = sites_and_seasons(overrides, ("AZ", "IL", "WA"), ("01-10", "04-20", "07-15"))
     run = record(configs, 4 * 96, None, "f64")
     for name in LEDGERS if thermal == "quasi_steady" else TRANSIENT_LEDGERS:
@@ -474,8 +692,8 @@ def test_chiller_that_falls_short_in_frost_gets_warmer_condenser_water() -> None
     derated, _ = steady([*york, event % 0.9], [-5.0], [-6.0])
     assert full.unmet_w == derated.unmet_w == 0
     assert design.fullest_condenser_c > 20.0
-    # The lift of warmer water costs power.
-    assert derated.chiller_w > 1.3 * full.chiller_w
+    # The lift of warmer water costs power; the water is no warmer than the load needs.
+    assert 1.03 * full.chiller_w < derated.chiller_w < 1.3 * full.chiller_w
     broken, _ = steady([*york, event % 0.5], [-5.0], [-6.0])
     assert broken.unmet_w > 0.2 * broken.cooling_load_w
 

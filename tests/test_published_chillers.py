@@ -63,7 +63,7 @@ def test_default_follows_the_published_map_at_full_load() -> None:
         outdoor_c=0.0,
         reference_cop=5.97,
     )
-    ratio = machine.power_w / 1e6 / trane_eir(chilled_c[lift], condenser_c[lift])
+    ratio = machine.power_w / machine.evaporator_w / trane_eir(chilled_c[lift], condenser_c[lift])
     assert np.all(np.abs(ratio - 1.0) < 0.03)
     assert abs(ratio.mean() - 1.0) < 0.005
 

@@ -218,6 +218,11 @@ class ChillerConfig(Section):
     min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
     """Lowest temperature of the condenser water that enters the chiller, in C, 0..60: from the
     freezing point of water to the condensing temperatures of refrigerants."""
+    max_condenser_c: Annotated[float, Field(ge=20, le=80)] = 40.0
+    """Highest temperature of the condenser water that enters the chiller, in C, 20..80: from cold
+    climates to heat pumps. Where the tower cannot hold it, the control of the head pressure unloads
+    the chiller. The default follows from a cut-out of 1 bar above air pressure with R-123,
+    46 to 48 C of condensation at 93 % of it, minus the range of the water and 1 to 2 K."""
     min_lift_k: Annotated[float, Field(ge=0.1, le=50)] = MIN_LIFT_K
     """Smallest lift of the compressor (entering condenser water minus leaving chilled water), in K,
     for models ``centrifugal_vsd`` and ``carnot``, 0.1..50: the COP of ``carnot`` diverges at 0 K,
@@ -229,11 +234,17 @@ class TowerConfig(Section):
 
     model: Annotated[str, NameIn(TOWERS)] = "yorkcalc"
     """Tower model: fan power and water temperature as functions of the heat to reject."""
+    setpoint: Literal["reset", "approach"] | None = None
+    """Setpoint of the water that leaves the tower: ``reset`` by load and wet bulb, so that chiller
+    and fan together draw least power, or ``approach``, as cold as chiller or economiser can use
+    but at least ``approach_min_k`` above the wet bulb. None means ``reset`` for model ``yorkcalc``
+    and ``approach`` for the others, which have no water loop and allow nothing else."""
     approach_min_k: ExchangerK = 4.0
-    """Smallest approach: coldest water from the tower minus wet-bulb temperature, in K."""
+    """Approach at the design point: water from the tower minus wet-bulb temperature, in K. With
+    ``setpoint: approach`` it is also the smallest approach at any load."""
     water_range_k: WaterRangeK = 5.56
     """Tower range at the design point: entering minus leaving water temperature, in K."""
-    fan_w_per_w_rejected: Annotated[float, Field(ge=0, le=1)] = 0.02
+    fan_w_per_w_rejected: Annotated[float, Field(ge=0, le=1)] = 0.0126
     """Design fan power divided by the heat rejected at the design point, in W per W, 0..1: at 1 the
     fan would heat the air as much as the rejected heat does."""
     airflow_m3s_per_w_rejected: Annotated[float, Field(ge=5e-6, le=2e-4)] = 2.667e-5
@@ -251,6 +262,20 @@ class TowerConfig(Section):
     economiser_approach_k: RiseK = 5.0
     """Approach of tower and heat exchanger together: coldest water from the exchanger minus
     wet-bulb temperature, in K."""
+
+    @property
+    def resets(self) -> bool:
+        """True if the setpoint of the tower water follows load and wet bulb."""
+        return TOWERS[self.model].water_loop and self.setpoint != "approach"
+
+    @model_validator(mode="after")
+    def _reset_needs_water(self) -> Self:
+        if self.setpoint == "reset" and not TOWERS[self.model].water_loop:
+            raise ValueError(
+                f"setpoint reset needs a water loop, which model {self.model} does not have; valid "
+                "is approach"
+            )
+        return self
 
     @model_validator(mode="after")
     def _exchanger_adds(self) -> Self:

@@ -15,12 +15,13 @@ import numpy as np
 
 from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.chiller import ChillerModel, ChillerPoint, ChillerResult
-from sdc_taichi.plant.tower import TowerModel, TowerPoint
+from sdc_taichi.plant.tower import TowerModel, TowerPoint, yorkcalc_largest_w, yorkcalc_reset_c
 from sdc_taichi.plant.water_side import (
     LEAST_OUTDOOR_UNITS,
     WaterSideDesign,
     chilled_water_c,
     chilled_water_load_w,
+    coil_capacity_w,
     economiser_share,
     loop_pump_w,
 )
@@ -62,6 +63,9 @@ class Devices(NamedTuple):
     """Cooling tower model."""
     limited: bool
     """True if the capacity of the devices limits the heat that the plant removes."""
+    reset: bool = False
+    """True if the setpoint of the tower water follows load and weather, False if it is the coldest
+    useful water down to a fixed approach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,93 +84,227 @@ def water_cooled(
     """Step a water-cooled plant: remove up to ``requested_w`` and reject it by a cooling tower.
 
     The chilled-water temperature is setpoint - coil approach, limited to the warmest water that the
-    chiller makes. The integrated economiser precools the return water with tower water as cold as
-    the weather allows, and the chiller removes the remaining heat. Economiser and chiller also
-    remove the heat of the chilled-water pumps, which reduces the capacity available to the hall.
-    Tower and chiller depend on each other. The tower is therefore solved first, with the chiller
-    power at the tower setpoint; then chiller and economiser, at the resulting water temperature.
+    chiller makes. The integrated economiser precools the return water with tower water, and the
+    chiller removes the remaining heat. Economiser and chiller also remove the heat of the
+    chilled-water pumps, which reduces the capacity available to the hall.
+
+    The plant compares two setpoints of the tower water, one for the chiller alone and a colder one
+    for the economiser, and takes the one with which chiller, tower fan and condenser pumps draw
+    less, so free cooling never costs more than it saves. A watt of heat that stays in the hall
+    counts as a watt of power, more than any chiller needs to remove it.
+
+    The cells that work receive all of the water, however many have failed, and cool it as far as
+    they can. Where they cannot reject all heat with water at ``max_condenser_c``, the chiller
+    unloads to what they can.
     """
-    # Running tower cells take over the water of failed ones, but the capacity per cell is limited.
-    capacity_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
-    load_w = np.minimum(requested_w, capacity_w) if devices.limited else requested_w
+    load_w = np.minimum(requested_w, coil_capacity_w(design)) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
-
-    def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
-        load_w = taken_w * (1.0 - economiser)
-        return _run_chiller(load_w, chilled_c, condenser_c, point, design, devices)
-
     # The economiser is in the return pipe of the coils, upstream of the bypass of the chiller.
-    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
-    return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
-    coldest_c = point.wet_bulb_c + design.approach_min_k
-    share = _economiser_share_at(coldest_c, chilled_c, return_water_c, design)
-    tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
-    foreseen = run_chiller(share, np.maximum(tower_setpoint_c, design.min_condenser_c))
-    heat_w = taken_w * share + foreseen.rejected_w
-    flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
-    tower_water_kg_s = design.tower_water_kg_s * flow_ratio
-    units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
-    cooled = devices.tower.step(
-        heat_w,
-        TowerPoint(
+    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(
+        load_w, design, limited=devices.limited
+    )
+    loop = _TowerLoop(
+        taken_w, chilled_c, design.chilled_water_range_k * range_ratio, point, design, devices
+    )
+    alone, precooled = (loop.at(setpoint_c) for setpoint_c in loop.setpoints_c())
+    pairs = zip(alone, precooled, strict=True)
+    chosen = _Operation(*(np.where(precooled.cost_w < alone.cost_w, y, x) for x, y in pairs))
+    left_w = taken_w - chosen.economiser_w
+    removed_w = np.maximum(load_w - chosen.unmet_w, 0.0) if devices.limited else load_w
+    return WaterSideResult(
+        heat_removed_w=removed_w,
+        economiser_w=chosen.economiser_w,
+        chiller_load_w=left_w - chosen.unmet_w if devices.limited else left_w,
+        chiller_w=chosen.chiller_w,
+        rejected_w=chosen.rejected_w,
+        chilled_water_c=chilled_c,
+        condenser_water_c=chosen.leaving_c,
+        tower_range_k=chosen.range_k,
+        tower_water_kg_s=chosen.water_kg_s,
+        humidifier_kg_s=0.0 * taken_w,
+        tower_airflow_m3s=chosen.airflow_m3s,
+        tower_fan_w=chosen.fan_w,
+        chilled_pump_w=chilled_pump_w,
+        condenser_pump_w=chosen.pump_w,
+    )
+
+
+class _Operation(NamedTuple):
+    """Operation of tower, economiser and chiller at one setpoint of the tower water."""
+
+    economiser_w: F64
+    """Heat that the economiser removes from the chilled water, in W, (B,)."""
+    unmet_w: F64
+    """Heat that neither economiser nor chiller removes, in W, (B,)."""
+    chiller_w: F64
+    """Power of the chiller, in W, (B,)."""
+    rejected_w: F64
+    """Heat of economiser and condenser, in W, (B,)."""
+    leaving_c: F64
+    """Temperature of the water that leaves the tower, in C, (B,)."""
+    range_k: F64
+    """Entering minus leaving temperature of the tower water, in K, (B,)."""
+    water_kg_s: F64
+    """Tower water flow, in kg/s, (B,)."""
+    airflow_m3s: F64
+    """Airflow into the tower, in m3/s, (B,)."""
+    fan_w: F64
+    """Power of the tower fan, in W, (B,)."""
+    pump_w: F64
+    """Power of the condenser-water pumps, in W, (B,)."""
+    cost_w: F64
+    """Power of chiller, tower fan and condenser pumps, plus the heat that stays, in W, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _TowerLoop:
+    """Loop of the tower water in one step, to which economiser and chiller reject their heat."""
+
+    taken_w: F64
+    """Heat of coils and chilled-water pumps, in W, (B,)."""
+    chilled_c: F64
+    """Chilled-water supply temperature, in C, (B,)."""
+    range_k: F64
+    """Chilled-water range at the coils, in K, (B,)."""
+    point: PlantPoint
+    """State of the hall's air and of the weather."""
+    design: WaterSideDesign
+    """Sized devices."""
+    devices: Devices
+    """Models of the devices."""
+
+    def setpoints_c(self) -> tuple[F64, F64]:
+        """Return the setpoints of the tower water for the chiller alone and for the economiser.
+
+        With the reset they minimise the power of chiller and fan. Otherwise they are the coldest
+        water that chiller or economiser can use, but at least wet bulb plus approach. Neither is
+        colder than the water at full fan speed.
+        """
+        design = self.design
+        nearest_c = self.point.wet_bulb_c + design.approach_min_k
+        useful_c = self.chilled_c - design.exchanger_approach_k
+        alone_c = np.maximum(nearest_c, design.min_condenser_c)
+        precooled_c = np.maximum(nearest_c, useful_c)
+        if self.devices.tower.water_loop:
+            heat_w = self._chiller(self.taken_w, alone_c).rejected_w
+            by_lift = (
+                design.idle_w_per_w_k * design.chiller_w + design.load_w_per_w_k * self.taken_w
+            )
+            chiller_w = design.idle_w_per_w * design.chiller_w + design.load_w_per_w * self.taken_w
+            by_share = chiller_w / self.range_k
+            full_c, (best_alone_c, best_precooled_c) = yorkcalc_reset_c(
+                heat_w, self._tower_point(heat_w, alone_c), (np.maximum(by_lift, 0.0), by_share)
+            )
+            if self.devices.reset:
+                least_c = np.maximum(design.min_condenser_c, self.chilled_c + design.useful_lift_k)
+                most_c = np.maximum(nearest_c, design.design_condenser_c)
+                alone_c = np.maximum(np.minimum(best_alone_c, most_c), least_c)
+                precooled_c = np.maximum(np.minimum(best_precooled_c, most_c), useful_c)
+                alone_c = self._capable_c(self.taken_w, alone_c, np.maximum(full_c, least_c))
+            alone_c, precooled_c = np.maximum(alone_c, full_c), np.maximum(precooled_c, full_c)
+        return alone_c, precooled_c
+
+    def at(self, setpoint_c: F64) -> _Operation:
+        """Operate tower, economiser and chiller at a setpoint of the tower water, in C, (B,).
+
+        Economiser and chiller receive water at the setpoint. Their heat depends on it, and the
+        water of a tower at full speed on their heat, so its water may differ from the setpoint by
+        some 0.1 K there; see ``setpoints_c``.
+        """
+        design = self.design
+        share = design.economiser * economiser_share(
+            self.chilled_c + self.range_k,
+            chilled_water_c=self.chilled_c,
+            tower_water_c=setpoint_c + design.exchanger_approach_k,
+        )
+        left_w, economiser_w = self.taken_w * (1.0 - share), self.taken_w * share
+        machine = self._chiller(left_w, setpoint_c)
+        rejected_w, unmet_w = economiser_w + machine.rejected_w, left_w - machine.evaporator_w
+        tower_point = self._tower_point(rejected_w, setpoint_c)
+        cooled = self.devices.tower.step(rejected_w, tower_point)
+        pump_w = loop_pump_w(rejected_w, design.rejected_w, design.condenser_pump_w, design)
+        return _Operation(
+            economiser_w=economiser_w,
+            unmet_w=unmet_w,
+            chiller_w=machine.power_w,
+            rejected_w=rejected_w,
+            leaving_c=cooled.leaving_c,
+            range_k=cooled.range_k,
+            water_kg_s=tower_point.water_kg_s,
+            airflow_m3s=cooled.air_ratio * tower_point.reference_air_m3s,
+            fan_w=cooled.fan_w,
+            pump_w=pump_w,
+            cost_w=machine.power_w + cooled.fan_w + pump_w + unmet_w,
+        )
+
+    def _tower_point(self, heat_w: F64, setpoint_c: F64) -> TowerPoint:
+        """Return the operating point of the working cells for the heat to reject, in W, (B,)."""
+        design, point = self.design, self.point
+        units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
+        flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
+        return TowerPoint(
             wet_bulb_c=point.wet_bulb_c,
             outdoor_c=point.outdoor_c,
-            condenser_setpoint_c=tower_setpoint_c,
+            condenser_setpoint_c=setpoint_c,
             supply_setpoint_c=point.setpoint_c,
-            water_kg_s=tower_water_kg_s,
+            water_kg_s=design.tower_water_kg_s * flow_ratio,
             reference_water_kg_s=design.tower_reference_kg_s * units,
             reference_air_m3s=design.tower_air_m3s * units,
             design_fan_w=design.tower_fan_w * units,
             air_j_per_m3_k=design.air_j_per_m3_k,
-        ),
-    )
-    share = _economiser_share_at(cooled.leaving_c, chilled_c, return_water_c, design)
-    # Head pressure control: a bypass keeps the condenser water at or above the chiller's minimum
-    # temperature or, if its capacity is short, at or above the temperature of largest capacity.
-    short = foreseen.unmet_w > 0.0
-    warm_c = np.where(short, design.fullest_condenser_c, design.min_condenser_c)
-    machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
-    economiser_w = taken_w * share
-    return WaterSideResult(
-        heat_removed_w=_removed_w(load_w, machine, devices),
-        economiser_w=economiser_w,
-        chiller_load_w=machine.evaporator_w if devices.limited else taken_w - economiser_w,
-        chiller_w=machine.power_w,
-        rejected_w=economiser_w + machine.rejected_w,
-        chilled_water_c=chilled_c,
-        condenser_water_c=cooled.leaving_c,
-        tower_range_k=cooled.range_k,
-        tower_water_kg_s=tower_water_kg_s,
-        humidifier_kg_s=0.0 * heat_w,
-        tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s * units,
-        tower_fan_w=cooled.fan_w,
-        chilled_pump_w=chilled_pump_w,
-        condenser_pump_w=loop_pump_w(heat_w, design.rejected_w, design.condenser_pump_w, design),
-    )
+            cells_water_kg_s=design.tower_water_kg_s * units,
+        )
 
+    def _chiller(self, load_w: F64, water_c: F64) -> ChillerResult:
+        """Compute one step of the chiller with tower water at ``water_c``, (B,).
 
-def _economiser_share_at(
-    tower_water_c: F64, chilled_water_c: F64, return_water_c: F64, design: WaterSideDesign
-) -> F64:
-    """Return the share of the cooling load that the economiser removes, 0..1, (B,)."""
-    return design.economiser * economiser_share(
-        return_water_c,
-        chilled_water_c=chilled_water_c,
-        tower_water_c=tower_water_c + design.exchanger_approach_k,
-    )
+        Head-pressure control: a bypass keeps the condenser water at or above the chiller's lowest
+        temperature. Where the capacity is short there, the bypass warms the water towards the
+        temperature of the largest capacity, as far as the load needs.
+        """
+        entering_c = np.maximum(water_c, self.design.min_condenser_c)
+        if self.devices.limited:
+            load_w = np.minimum(load_w, self._largest_load_w())
+            warmest_c = np.maximum(entering_c, self.design.fullest_condenser_c)
+            entering_c = self._capable_c(load_w, entering_c, warmest_c)
+        return self._chiller_at(load_w, entering_c)
 
+    def _capable_c(self, load_w: F64, water_c: F64, other_c: F64) -> F64:
+        """Return water at ``water_c``, or as much closer to ``other_c`` as the load needs, (B,).
 
-def _tower_setpoint_c(
-    coldest_c: F64, share: F64, chilled_water_c: F64, design: WaterSideDesign
-) -> F64:
-    """Return the setpoint of the water that leaves the tower, in C, (B,).
+        Where the capacity of the chiller is short with the former and larger with the latter, the
+        capacity in between is at least that of a straight line.
+        """
+        available_w, other_w = (
+            self._chiller_at(load_w, each_c).available_w for each_c in (water_c, other_c)
+        )
+        gain_w = np.maximum(other_w - available_w, _LEAST_W)
+        needed = np.clip((load_w - available_w) / gain_w, 0.0, 1.0)
+        return water_c + (other_c - water_c) * np.where(other_w > available_w, needed, 0.0)
 
-    The setpoint is the coldest temperature that the economiser can use if it runs, else the coldest
-    that the chiller can use. It is at least the coldest temperature that the weather allows.
-    """
-    economiser_c = chilled_water_c - design.exchanger_approach_k
-    useful_c = np.where(share > 0, economiser_c, design.min_condenser_c)
-    return np.maximum(coldest_c, useful_c)
+    def _largest_load_w(self) -> Values:
+        """Return the load with which the condenser's heat just leaves at ``max_condenser_c``, (B,).
+
+        The control of the head pressure unloads a chiller whose condenser becomes too warm, instead
+        of letting it trip (Trane, CVGF-SVX03B-EN, "Condenser Limit").
+        """
+        design = self.design
+        if not self.devices.tower.water_loop:
+            return self.taken_w
+        lowest_w = design.pump_min_ratio * design.rejected_w
+        rejected_w = yorkcalc_largest_w(
+            design.max_condenser_c,
+            design.tower_range_k,
+            self._tower_point(lowest_w, design.max_condenser_c),
+        )
+        working = np.minimum(design.outdoor_units / LEAST_OUTDOOR_UNITS, 1.0)
+        return working * rejected_w * design.hot_evaporator_share
+
+    def _chiller_at(self, load_w: F64, condenser_c: F64) -> ChillerResult:
+        """Compute one step of the chiller with the given condenser water, (B,)."""
+        return _run_chiller(
+            load_w, self.chilled_c, condenser_c, self.point, self.design, self.devices
+        )
 
 
 def air_cooled(
@@ -189,14 +327,16 @@ def air_cooled(
     speed worthwhile up to which 4 P_full q^3 = c Q_full. ``_worthwhile`` decides whether the cooler
     runs at all.
     """
-    load_w = np.minimum(requested_w, design.pumped_w) if devices.limited else requested_w
+    load_w = np.minimum(requested_w, coil_capacity_w(design)) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
-    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
+    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(
+        load_w, design, limited=devices.limited
+    )
     range_k = design.chilled_water_range_k * range_ratio
     over_k = np.maximum(chilled_c + range_k - point.outdoor_c, 0.0)
     full_range_k = design.chilled_water_range_k + design.dry_cooler_approach_k
     cooler_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
-    full_speed_w = design.economiser * design.outdoor_units * cooler_w * over_k / full_range_k
+    full_speed_w = design.economiser * _coolers_share(design) * cooler_w * over_k / full_range_k
     full_fan_w = design.tower_fan_w * design.outdoor_units
 
     def run(free_w: F64) -> WaterSideResult:
@@ -225,6 +365,20 @@ def air_cooled(
     short_w = load_w - without.heat_removed_w
     with_free = run(np.minimum(most_w, np.maximum(worthwhile_w, short_w)))
     return _mixed(without, with_free, _worthwhile(without, with_free, short_w))
+
+
+def _coolers_share(design: WaterSideDesign) -> F64:
+    """Return the heat of the working dry coolers divided by that of all, at full fan speed, (B,).
+
+    The working coolers receive all of the water, so it leaves them warmer, and each removes more
+    heat than at design. With the difference of the mean temperatures of water and air, the heat
+    for each kelvin between entering water and air is 1/(1/(2 C) + (1/(2 C_air) + 1/UA)/u), with the
+    share u of the coolers and the capacity flow C of the water. The design range and approach give
+    the second resistance.
+    """
+    u, range_k = design.outdoor_units, design.chilled_water_range_k
+    inlet_k = range_k + design.dry_cooler_approach_k
+    return as_array(u * inlet_k / (inlet_k - 0.5 * range_k * (1.0 - u)))
 
 
 def air_side(
@@ -270,13 +424,15 @@ def air_side(
         free_w = outdoor_m3s * over_w_s_m3
         coil_w = load_w - free_w
         if devices.limited:
-            coil_w = np.minimum(coil_w, design.pumped_w)
+            coil_w = np.minimum(coil_w, coil_capacity_w(design))
         mixed_c = point.return_c - free_w / (design.air_j_per_m3_k * point.airflow_m3s)
         cooled_k = np.maximum(np.maximum(mixed_c, point.setpoint_c) - chilled_c, _LEAST_K)
         dried_m3s = np.maximum(coil_w, 0.0) / (design.air_j_per_m3_k * cooled_k)
         total_m3s = np.maximum(outdoor_m3s + dried_m3s, _LEAST_M3S)
         latent_w = wetter_w_s_m3 * outdoor_m3s * dried_m3s / total_m3s
-        taken_w, chilled_pump_w, _ = chilled_water_load_w(coil_w + latent_w, design)
+        taken_w, chilled_pump_w, _ = chilled_water_load_w(
+            coil_w + latent_w, design, limited=devices.limited
+        )
         machine = _run_chiller(taken_w, chilled_c, point.outdoor_c, point, design, devices)
         wetted_kg_s = lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K
         return _dry(

@@ -60,6 +60,24 @@ EnergyPlus)."""
 MIN_AIR_RATIO = 0.2
 """Lowest airflow of a running fan divided by that at full speed; for smaller mean airflows the fan
 cycles on and off (default of EnergyPlus)."""
+CYCLING_APPROACH_RATIO = 0.8
+"""Largest approach while a cycling fan is on, divided by that with the fan off. At very small heat,
+YorkCalc gives the slowest fan a larger approach than free convection; there a cycling fan runs
+faster, so that its mean power begins at 0."""
+
+OVERFED_SHARE = 0.2
+"""Share of the water above a cell's design flow that does not count in the liquid-to-gas ratio.
+
+More water wets more of the fill, so that a cell that receives the water of failed cells cools it
+better than YorkCalc, measured at 75 to 125 % of the design flow, gives at the same ratio. The share
+is fitted to the integral of Merkel with a transfer number KaV/L proportional to (L/G)^-0.5, in the
+middle of published exponents (ASHRAE Handbook, HVAC Systems and Equipment, "Cooling towers"). At
+twice the flow and 25.6 C wet bulb, it gives an approach of 8.0 K, as does the integral.
+"""
+NO_LIMIT_KG_S = 1e30
+"""Water flow that no cell receives."""
+LEAST_W = 1e-3
+"""Lower bound of the design fan power in the rule for the fan speed, in W."""
 
 _LEAST_K = 1e-9
 """Lower bound of a divisor that is a difference of approaches, in K; prevents division by zero."""
@@ -86,6 +104,8 @@ class TowerPoint(NamedTuple):
     """Fan power at full speed, in W, (B,)."""
     air_j_per_m3_k: Values
     """Volumetric heat capacity of air, in J/(m3 K), (B,)."""
+    cells_water_kg_s: Values = NO_LIMIT_KG_S
+    """Design water flow of the cells that work, in kg/s, (B,)."""
 
 
 class TowerDesignPoint(NamedTuple):
@@ -146,6 +166,9 @@ class TowerModel:
     condenser plus the heat of the economiser."""
     size: Callable[[TowerDesignPoint], TowerSize]
     """Function that sizes the towers for a design point."""
+    water_loop: bool = False
+    """True if heat, weather and fan speed determine the temperature of the water; False if the
+    water is always at its setpoint."""
 
 
 def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> F64:
@@ -256,23 +279,27 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
     The tower always rejects all heat: the range is r = heat_w/(c*m). If the fan cannot hold the
     setpoint even at full speed, the leaving water is warmer than the setpoint. Otherwise the fan
     runs as slowly as the setpoint allows. If that speed is below ``MIN_AIR_RATIO``, the fan cycles
-    on and off at ``MIN_AIR_RATIO``. With the fan off the tower has the share f of its full-speed
+    on and off at ``MIN_AIR_RATIO``, or at very small heat at the speed that
+    ``CYCLING_APPROACH_RATIO`` gives. With the fan off the tower has the share f of its full-speed
     cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)). A tower with range r and fan off
     would thus have the range r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
     bypass prevents water colder than the setpoint: with the fan off, air and water pass each other
     only as much as the heat needs, see ``_free_convection_share``.
     """
     range_k = _range_k(heat_w, point.water_kg_s)
-    water_ratio = point.water_kg_s / point.reference_water_kg_s
+    water_ratio = _water_ratio(point)
     wanted_k = point.condenser_setpoint_c - point.wet_bulb_c
     parabola = _approach_parabola(point.wet_bulb_c, range_k)
     full_speed_k = _approach_at(water_ratio, *parabola)
-    low_speed_k = np.maximum(_approach_at(water_ratio / MIN_AIR_RATIO, *parabola), full_speed_k)
     fan_off_k = _fan_off_approach_k(point.wet_bulb_c, range_k, water_ratio)
+    low_speed_k = _approach_at(water_ratio / MIN_AIR_RATIO, *parabola)
+    low_speed_k = np.minimum(low_speed_k, CYCLING_APPROACH_RATIO * fan_off_k)
+    low_speed_k = np.maximum(low_speed_k, full_speed_k)
 
     # If full speed cannot reach the wanted approach, use the liquid-to-gas ratio of full speed.
     loaded = range_k > 0.0
-    ratio = np.maximum(_ratio_at(wanted_k, *parabola), np.where(loaded, water_ratio, 1.0))
+    running_k = np.minimum(wanted_k, low_speed_k)
+    ratio = np.maximum(_ratio_at(running_k, *parabola), np.where(loaded, water_ratio, 1.0))
     speed = np.maximum(water_ratio / ratio, MIN_AIR_RATIO)
     # A cycling fan gives an approach that is linear in the share of time during which it is on.
     on_share = (fan_off_k - wanted_k) / np.maximum(fan_off_k - low_speed_k, _LEAST_K)
@@ -286,6 +313,68 @@ def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
         leaving_c=point.wet_bulb_c + np.where(loaded, np.maximum(wanted_k, full_speed_k), wanted_k),
         range_k=range_k,
         wet_bulb_c=point.wet_bulb_c,
+    )
+
+
+def yorkcalc_reset_c(
+    heat_w: Values, point: TowerPoint, w_per_k: tuple[Values, ...]
+) -> tuple[F64, tuple[F64, ...]]:
+    """Return the temperatures of the leaving water at full fan speed and at the best fan speeds.
+
+    At the best speed s, the power of the fan and the power of the plant, which grows with the water
+    temperature T, change by the same amount: 3 P_des s^2 = -k dT/ds. With T = T_wb + a + b w/s +
+    c (w/s)^2, in which w is the liquid-to-gas ratio at full speed,
+
+        s^4 = k w (b + 2 c w/s) / (3 P_des),    with w/s = w on the right side, since c is small.
+
+    That fan and chiller draw least where their marginal powers balance is the basis of the
+    near-optimal tower control of Braun and Diderrich (ASHRAE Transactions 96(2), 1990; ASHRAE
+    Handbook, HVAC Applications, "Supervisory control strategies and optimization") and of
+    extremum-seeking control of tower fans (arXiv:2605.15431).
+
+    Args:
+        heat_w: Heat to reject, W, (B,).
+        point: Weather, flows and sizes; the setpoint is not used.
+        w_per_k: Growth of the power of the plant with the water temperature, k, in W/K, (B,), for
+            each best speed.
+
+    Returns:
+        Temperature at full speed and those at the best speeds, C, (B,).
+    """
+    w = _water_ratio(point)
+    a, b, c = _approach_parabola(point.wet_bulb_c, _range_k(heat_w, point.water_kg_s))
+    slope = w * np.maximum(b + 2.0 * c * w, 0.0) / (3.0 * np.maximum(point.design_fan_w, LEAST_W))
+    speeds = (np.clip(np.sqrt(np.sqrt(k * slope)), MIN_AIR_RATIO, 1.0) for k in w_per_k)
+    full_c, *best_c = (
+        as_array(point.wet_bulb_c + _approach_at(w / s, a, b, c)) for s in (1.0, *speeds)
+    )
+    return full_c, tuple(best_c)
+
+
+def yorkcalc_largest_w(leaving_c: Values, range_k: Values, point: TowerPoint) -> F64:
+    """Return the largest heat that leaves the water at a temperature, at full fan speed, in W.
+
+    Args:
+        leaving_c: Temperature of the leaving water, C, (B,).
+        range_k: Range at which the pumps adapt the water flow to the heat, K, (B,).
+        point: Weather and sizes; its water flow is the smallest of the pumps. If the cells cannot
+            take that much at ``range_k``, the range is smaller.
+    """
+    approach_k = leaving_c - point.wet_bulb_c
+    counted_kg_s = point.reference_water_kg_s * _ratio_at(
+        approach_k, *_approach_parabola(point.wet_bulb_c, range_k)
+    )
+    excess_kg_s = np.maximum(counted_kg_s - point.cells_water_kg_s, 0.0)
+    water_kg_s = counted_kg_s + excess_kg_s * OVERFED_SHARE / (1.0 - OVERFED_SHARE)
+    a, b, c = _approach_by_range(point.wet_bulb_c, _water_ratio(point))
+    above_k = np.maximum(approach_k - a, 0.0)
+    slope_k = b + np.sqrt(np.maximum(b**2 + 4.0 * c * above_k, 0.0))
+    small_range_k = np.minimum(2.0 * above_k / np.maximum(slope_k, _LEAST_K), range_k)
+    largest_kg_k_s = np.maximum(water_kg_s * range_k, 0.0)
+    at_smallest_flow = water_kg_s < point.water_kg_s
+    return as_array(
+        WATER_J_PER_KG_K
+        * np.where(at_smallest_flow, point.water_kg_s * small_range_k, largest_kg_k_s)
     )
 
 
@@ -366,7 +455,7 @@ def paper_size(design: TowerDesignPoint) -> TowerSize:
 
 
 TOWERS: dict[str, TowerModel] = {
-    "yorkcalc": TowerModel(yorkcalc, yorkcalc_size),
+    "yorkcalc": TowerModel(yorkcalc, yorkcalc_size, water_loop=True),
     "released": TowerModel(released, released_size),
     "paper": TowerModel(paper, paper_size),
 }
@@ -380,6 +469,23 @@ def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Val
     in_range = [[p + t * (q + t * u) for p, q, u in powers] for powers in YORKCALC]
     a, b, c = (p + r * (q + r * u) for p, q, u in in_range)
     return a, b, c
+
+
+def _approach_by_range(
+    wet_bulb_c: Values, liquid_gas_ratio: Values
+) -> tuple[Values, Values, Values]:
+    """Return the coefficients of the approach in powers 0, 1 and 2 of the range."""
+    t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
+    x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
+    by_ratio = [[p + t * (q + t * u) for p, q, u in powers] for powers in YORKCALC]
+    a, b, c = (r0 + x * (r1 + x * r2) for r0, r1, r2 in zip(*by_ratio, strict=True))
+    return a, b, c
+
+
+def _water_ratio(point: TowerPoint) -> Values:
+    """Return the liquid-to-gas ratio at full fan speed; see ``OVERFED_SHARE``."""
+    excess_kg_s = np.maximum(point.water_kg_s - point.cells_water_kg_s, 0.0)
+    return (point.water_kg_s - OVERFED_SHARE * excess_kg_s) / point.reference_water_kg_s
 
 
 def _fan_off_approach_k(wet_bulb_c: Values, range_k: Values, water_ratio: Values) -> F64:

@@ -16,6 +16,8 @@ LEAST_COIL_LOAD = 0.1
 """Coil load divided by design load below which the chilled-water range no longer changes."""
 CYCLING_BELOW = 0.05
 """Heat of a water loop divided by its design heat below which its pumps cycle on and off."""
+LEAST_PUMPED_W = 1e-3
+"""Lower bound of the heat that the pumps can carry in equations that divide by it, in W."""
 LEAST_OUTDOOR_UNITS = 0.01
 """Lower bound of the share of outdoor units in equations that divide by it."""
 
@@ -34,6 +36,8 @@ class WaterSideDesign:
     """Heat that the plant rejects at design, in W, (B,)."""
     tower_water_kg_s: F64
     """Condenser water flow at design, in kg/s, (B,)."""
+    tower_range_k: F64
+    """Range of the tower at design, in K, (B,)."""
     tower_reference_kg_s: F64
     """Reference water flow of the tower's liquid-to-gas ratio, in kg/s, (B,)."""
     tower_air_m3s: F64
@@ -53,6 +57,8 @@ class WaterSideDesign:
     """Share of the power of the chilled-water pumps that heats the chilled water, 0..1, (B,)."""
     coil_approach_k: F64
     """Coil approach: supply air minus chilled-water supply temperature, in K, (B,)."""
+    coil_rise_k: F64
+    """Rise of the air temperature from supply to return at design, in K, (B,)."""
     chilled_water_range_k: F64
     """Chilled-water range at design: return minus supply temperature, in K, (B,)."""
     coil_valves: F64
@@ -66,13 +72,33 @@ class WaterSideDesign:
     """Lowest condenser-water temperature that the chiller allows, in C, (B,)."""
     fullest_condenser_c: F64
     """Condenser-water temperature at which the chiller has its largest capacity, in C, (B,)."""
+    max_condenser_c: F64
+    """Highest condenser-water temperature that the chiller allows, in C, (B,)."""
+    design_condenser_c: F64
+    """Condenser-water temperature at the design point, in C, (B,)."""
+    useful_lift_k: F64
+    """Condenser-water temperature minus chilled-water temperature below which colder condenser
+    water no longer reduces the power of the chiller, in K, (B,)."""
+    hot_evaporator_share: F64
+    """Heat taken from the chilled water divided by the heat of the condenser, with condenser water
+    at ``max_condenser_c``, (B,)."""
+    idle_w_per_w_k: F64
+    """Growth of the chiller's power with the temperature of its condenser water, extrapolated to no
+    load, divided by its reference capacity, in 1/K, (B,)."""
+    load_w_per_w_k: F64
+    """Growth of that growth with the load, in 1/K, (B,)."""
+    idle_w_per_w: F64
+    """Power of the chiller with the coldest condenser water that it allows, extrapolated to no
+    load, divided by its reference capacity, in W/W, (B,)."""
+    load_w_per_w: F64
+    """Growth of the power with the load at that temperature, in W/W, (B,)."""
     warmest_chilled_c: F64
     """Highest chilled-water temperature that the chiller makes, in C, (B,)."""
     economiser: F64
     """1 with a water-side economiser or free cooling by a dry cooler, 0 without, (B,)."""
     pumped_w: F64
-    """Heat that the working chilled-water pumps can carry, in W, (B,); equal to ``cooling_w`` if
-    all pumps work."""
+    """Heat that the working chilled-water pumps carry at the design range, in W, (B,); equal to
+    ``cooling_w`` if all pumps work."""
     outdoor_units: F64
     """Working share of the tower cells, dry coolers or outdoor air intakes, 0..1, (B,)."""
     dry_cooler_approach_k: F64
@@ -181,7 +207,32 @@ def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSid
     return as_array(on_share * (design_w * flow_ratio**3))
 
 
-def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64, F64]:
+def coil_capacity_w(design: WaterSideDesign) -> F64:
+    """Return the heat that the coils remove with the flow of the working pumps, in W, (B,).
+
+    With less water, its range grows, and its film resists the heat more. The heat of a coil for
+    each kelvin between return air and chilled water is 1/(1/(2 C) + 1/(2 C_air) + 1/UA), with the
+    difference of the mean temperatures of air and water. The design point gives the three
+    resistances: half the range of the water, half the rise of the air, and the rest of the
+    difference of the means, of which half is in the film of the water and grows with its flow to
+    the power -3/4 (see ``coil_range_ratio``). Air side and inlet temperatures are those of the
+    design point, at which full flow gives ``cooling_w``.
+
+    Args:
+        design: Sized devices.
+    """
+    flow = design.pumped_w / design.cooling_w
+    water_k, air_k = 0.5 * design.chilled_water_range_k, 0.5 * design.coil_rise_k
+    wall_k = 0.5 * np.maximum(design.coil_approach_k + air_k - water_k, 0.0)
+    # All resistances are multiplied by the flow, which may be 0.
+    resistance_k = water_k + flow * (air_k + wall_k) + np.sqrt(np.sqrt(flow)) * wall_k
+    whole_k = water_k + (air_k + wall_k) + wall_k
+    return as_array(design.cooling_w * (flow * whole_k / resistance_k))
+
+
+def chilled_water_load_w(
+    load_w: F64, design: WaterSideDesign, *, limited: bool
+) -> tuple[F64, F64, F64]:
     """Return the load of economiser and chiller: the heat of the coils and of the pumps.
 
     The shaft power of a pump heats the water, but the losses of its motor do not (EnergyPlus
@@ -190,12 +241,15 @@ def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64
     Args:
         load_w: Heat that the coils remove from the air, W, (B,).
         design: Sized devices.
+        limited: True if the working pumps limit the flow, and the range grows instead.
 
     Returns:
         Heat to remove from the chilled water, W, (B,); power of the chilled-water pumps, W, (B,);
         and the chilled-water range at the coils divided by the design range, (B,).
     """
     range_ratio = coil_range_ratio(load_w, design)
+    if limited:
+        range_ratio = np.maximum(range_ratio, load_w / np.maximum(design.pumped_w, LEAST_PUMPED_W))
     flow_w = load_w / range_ratio
     power_w = loop_pump_w(flow_w, design.cooling_w, design.chilled_pump_w, design)
     return load_w + design.pump_heat_share * power_w, power_w, range_ratio

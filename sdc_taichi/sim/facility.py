@@ -92,7 +92,10 @@ class Facility:
         self._stores_heat = self._load.stores_unmet_heat
         self._plant = PLANTS[models["plant"]]
         self._devices = Devices(
-            CHILLERS[models["chiller"]], TOWERS[models["tower"]], limited=self._stores_heat
+            CHILLERS[models["chiller"]],
+            TOWERS[models["tower"]],
+            limited=self._stores_heat,
+            reset=fleet.configs[0].hvac.tower.resets,
         )
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]

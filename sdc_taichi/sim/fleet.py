@@ -56,6 +56,7 @@ SHARED_FIELDS = (
     *STAGE_MODELS.values(),
     "simulation.steps_per_hour",
     "hvac.total_of",
+    "hvac.tower.setpoint",
     "electrical.losses",
     "simulation.substep_s",
     "workload.age_horizon_h",  # It is the length of the queue array, which the fleet shares.

@@ -35,6 +35,10 @@ all other sites."""
 OFF_DESIGN_MARGIN = 1.05
 """Maximum factor of chiller capacity to design load at water temperatures off the design point; it
 covers the growth of IT power with the setpoint, a few percent."""
+_SLOPE_K = 5.0
+"""Distance of the condenser-water temperatures that give the slope of the chiller's power, in K."""
+_LOADS = (0.2, 0.6)
+"""Loads of the chiller, as shares of its reference capacity, that give the dependences on load."""
 _GRID = np.linspace(0.0, 1.0, 5)
 """Positions, within their ranges, of the water temperatures for which chiller capacity is
 checked."""
@@ -119,7 +123,8 @@ def _check_sizes(fleet: Fleet, sized: Sizing) -> None:
     """Check that capacities, flows and powers of sized devices are finite and not negative."""
     sizes = fields_of(sized) | fields_of(sized.water_side) | fields_of(sized.chilled_water)
     for name, values in sizes.items():
-        if name in ("water_side", "power_path", "machine", "chilled_water") or name.endswith("_c"):
+        skipped = "water_side", "power_path", "machine", "chilled_water"
+        if name in skipped or name.endswith(("_c", "_w_k")):
             continue
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
@@ -349,6 +354,9 @@ def _design_chiller(
     ).min(axis=1)
     design_w_per_w = at(low_c, design_c, zero_w, unit_w).available_w
     least_w_per_w = np.minimum(w_per_w.min(axis=0), design_w_per_w)
+    if not PLANTS[fleet.models["plant"]].dry and TOWERS[fleet.models["tower"]].water_loop:
+        too_warm = design_c > v("hvac.chiller.max_condenser_c")
+        least_w_per_w = np.where(too_warm, 0.0, least_w_per_w)
     if np.any(least_w_per_w <= 0):
         dc = int(np.argmin(least_w_per_w))
         raise PhysicalLimitError(
@@ -392,6 +400,10 @@ def _water_side(
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
         fullest_condenser_c=v("hvac.chiller.min_condenser_c"),
+        tower_range_k=v("hvac.tower.water_range_k"),
+        max_condenser_c=v("hvac.chiller.max_condenser_c"),
+        coil_rise_k=cooling_w / (air_j_per_m3_k(fleet) * crac_flow_m3s),
+        **_condenser_slopes(fleet, outdoor_c, wet_bulb_c),
         warmest_chilled_c=np.full(fleet.size, CHILLERS[fleet.models["chiller"]].warmest_water_c),
         pumped_w=cooling_w,
         outdoor_units=np.ones(fleet.size),
@@ -400,6 +412,46 @@ def _water_side(
         **outdoor,
         **_pumps(fleet, cooling_w, rejected_w),
     )
+
+
+def _condenser_slopes(fleet: Fleet, outdoor_c: F64, wet_bulb_c: F64) -> dict[str, F64]:
+    """Return what the reset of the condenser water needs to know of the chiller, (B,) each.
+
+    The figures are those of the setpoint in the middle of its range, and of linear dependences on
+    condenser water and load.
+    """
+    v, model = fleet.values, CHILLERS[fleet.models["chiller"]]
+    machine, ones = _machine(fleet), np.ones(fleet.size)
+    coldest_c, hottest_c = v("hvac.chiller.min_condenser_c"), v("hvac.chiller.max_condenser_c")
+    design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
+    middle_c = 0.5 * (v("hvac.setpoint.min_c") + v("hvac.setpoint.max_c"))
+    water_below_k = fleet.setpoint_over_supply_k + v("hvac.chiller.coil_approach_k")
+    chilled_c = np.minimum(middle_c - water_below_k, model.warmest_water_c)
+
+    def power(load: float, condenser_c: F64) -> F64:
+        point = ChillerPoint(ones, chilled_c, condenser_c, outdoor_c, machine)
+        return np.asarray(model.step(load * ones, point).power_w)
+
+    low, high = _LOADS
+    at_low, at_high = (
+        (power(load, design_c) - power(load, design_c - _SLOPE_K)) / _SLOPE_K for load in _LOADS
+    )
+    by_load, load_w_per_w = (
+        (of_high - of_low) / (high - low)
+        for of_high, of_low in (
+            (at_high, at_low),
+            (power(high, coldest_c), power(low, coldest_c)),
+        )
+    )
+    return {
+        "design_condenser_c": design_c,
+        "useful_lift_k": machine.min_lift_k * model.least_lift,
+        "hot_evaporator_share": high / (high + power(high, hottest_c)),
+        "idle_w_per_w_k": at_low - low * by_load,
+        "load_w_per_w_k": by_load,
+        "idle_w_per_w": np.maximum(power(low, coldest_c) - low * load_w_per_w, 0.0),
+        "load_w_per_w": np.maximum(load_w_per_w, 0.0),
+    }
 
 
 def _outdoor_air_limits(fleet: Fleet) -> dict[str, F64]:
