@@ -443,7 +443,7 @@ def sized_plant(*overrides: str) -> tuple[WaterSideDesign, Devices]:
     with Simulator(config, drivers=drivers_from_arrays([20.0], [15.0], [300.0], [0.5])) as sim:
         sim.reset()
         hvac = config.hvac
-        models = CHILLERS[hvac.chiller.model], TOWERS[hvac.tower.model]
+        models = CHILLERS[hvac.chiller_in_use], TOWERS[hvac.tower.model]
         return sim.sizing.water_side, Devices(*models, limited=True, reset=hvac.tower.resets)
 
 
@@ -551,7 +551,7 @@ def test_coils_warm_little_water_more() -> None:
         small, large = sorted([flow / water_k, 1.0 / air_k])
         ratio, units = small / large, conductance / small
         gone = np.exp(-units * (1.0 - ratio))
-        return entering_k * small * (1.0 - gone) / (1.0 - ratio * gone)
+        return float(entering_k * small * (1.0 - gone) / (1.0 - ratio * gone))
 
     conductance = np.linspace(0.01, 2.0, 20_000)
     at_design = conductance[np.argmin([abs(heat(1.0, c) - 1.0) for c in conductance])]

@@ -230,7 +230,7 @@ class _TowerLoop:
             rejected_w=rejected_w,
             leaving_c=cooled.leaving_c,
             range_k=cooled.range_k,
-            water_kg_s=tower_point.water_kg_s,
+            water_kg_s=as_array(tower_point.water_kg_s),
             airflow_m3s=cooled.air_ratio * tower_point.reference_air_m3s,
             fan_w=cooled.fan_w,
             pump_w=pump_w,
