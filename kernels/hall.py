@@ -86,6 +86,7 @@ from .units import (
     run_crac_units,
     set_supply,
     sum_unit_needs,
+    weigh_units,
 )
 
 END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
@@ -401,7 +402,17 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
     n = hall.chunks[first_chunk].dc
     dc = hall.dcs[n]
     n_chunks = hall.dcs[n + 1].first_chunk - dc.first_chunk
-    sweeps_left = hall.sweeps if end_chunk - first_chunk == n_chunks else 1
+    is_whole = end_chunk - first_chunk == n_chunks
+    sweeps_left = hall.sweeps
+    if not is_whole and hall.sweeps > 0:
+        sweeps_left = 1
+    if ti.static(hall.recirculates):
+        # Weights of a data center that is split are fitted by a call without sweeps.
+        begins = is_whole
+        if hall.sweeps == 0:
+            begins = not is_whole and first_chunk == dc.first_chunk
+        if begins and dc.sweep == 0 and dc.coupling > 0.0:
+            weigh_units(hall, n, True)
     exchanges_after, amounts, terms_at = False, hall.zeros, slice_at * SCRATCH
     reference_c = ti.cast(hall.units[dc.first_unit].supply_c, hall.real)
     if ti.static(hall.recirculates and not hall.transient):

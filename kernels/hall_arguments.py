@@ -38,6 +38,11 @@ RANKS_PER_K = 2.0**27
 """Ranks per kelvin; ranks are rounded temperatures that identify the hottest rack. In f64 the
 temperatures of equal racks differ in their last bits, depending on the processor. Their ranks,
 7.5 nK apart, are equal. Adjacent numbers in f32 are further apart than ranks."""
+COVERED_WITHIN = 1e-6
+"""Share of their need that units may seem to lack, or to exceed, although they just cover it. At
+the design point units deliver just what racks need."""
+MOST_SUPPLY_RATIO = 10.0
+"""Largest ratio of supply to need that lowers exhaust shares further."""
 MIX_PATTERNS = LANES - 1
 """Number of exhaust mix patterns in the table of steady states of a dense hall. An entry of the
 table is a vector of the amount of each pattern, followed by the feedback gain."""
@@ -164,6 +169,13 @@ DC_DOUBLES = {
     "table_rows_per_k": "rows of the table per K of supply temperature",
     "feedback_gain": "change of the mixes by a sweep per previous common change",
     "crac_m3s_per_rack": "CRAC airflow divided by the number of racks, m3/s",
+    "coupling": "exponent of the weights of the units in their shares, 0 for shares that are fixed",
+    "follows_need": "1 if fans deliver what racks need, 0 if their speed is given",
+    "weighs": "1 if the weight of a unit differs from 1 in the next sweep",
+    "weighs_used": "value of weighs in the last sweep",
+    "oversupply": "decay of the exhaust shares per excess of supply over need",
+    "exceeds": "1 if a unit delivers more than its racks need, and thus lowers exhaust shares",
+    "exceeds_used": "value of exceeds in the last sweep",
     "shift_k": "common shift of the mixes since the last exchange, K (sparse or transient)",
     "last_change_k": "midpoint of exhaust changes since the exchange, one sweep ago, K",
     "last_shift_k": "change of shift_k in the last sweep, K",
@@ -198,6 +210,16 @@ UNIT_STATE = {
     "mean_supply_c": "supply air, in transient halls the mean of the substeps so far, C",
     "last_f_change": "change of fresh_ratio in the sweep before (steady air)",
     "last_supply_change_k": "change of supply air in the sweep before, K (steady air)",
+    "plain_m3s": "supply air that the racks demand at the exhaust shares of the design point, m3/s",
+    "taken_m3s": "supply air that racks take from the unit in a pass over weights, m3/s; then the "
+    "weight of the next pass",
+    "supply_ratio": "supply air that reaches the racks / their need at design exhaust shares",
+    "supply_ratio_used": "supply_ratio with which the last sweep computed the racks",
+    "weight": "weight of the unit in the supply of all racks at a coupling of 1, w of docs/hall.md",
+    "last_weight_change": "relative change of weight in the last pass",
+    "fitted_m3s": "airflow to which weight was fitted, m3/s; -1 for none",
+    "strength": "weight to the power of the coupling",
+    "strength_used": "strength with which the last sweep computed the racks",
 }
 RACK_STATE = {
     "mixed_c": "exhaust mix before the rack; transient: room air at its intake, C",
@@ -240,7 +262,9 @@ TERMS = {
 }
 """Sums over the blocks of a chunk, separately for each lane."""
 BLOCK_TERMS = {
-    "fresh_m3s": "supply air intake of the servers if units covered all need, m3/s",
+    "fresh_m3s": "supply air intake of the servers if units covered all need, m3/s; divided by the "
+    "sum of share times strength of the units",
+    "plain_m3s": "the same at the exhaust shares of the design point, m3/s (if units exceed)",
     "mixed_c": "mean temperature of recirculated air in the substep, C (transient)",
     "parcel_w": "heat that warms the recirculated air in the substep, W (transient)",
 }
@@ -263,6 +287,11 @@ SUMS = (
 )
 """Sums and extremes of each chunk. In transient halls, TERMS before ``flow_m3s`` are summed over
 the substeps, and the summed RACK_MEANS are means over the substeps."""
+PLENUM_NEED = {
+    "design_m3s": "supply air that the rack needs at the design point, m3/s",
+    "present_m3s": "supply air that the rack needs in the present sweep, m3/s",
+}
+"""Need of each rack for supply air, to which weights of coupled units are fitted."""
 DC_OUT = {
     "cpu_w": "power without fans, W",
     "it_fan_w": "power of the server fans, W",
@@ -287,6 +316,10 @@ DC_OUT = {
 
 def _numbers(kind: str, ndim: int, rows: Mapping[str, str] | None = None, of: str = "") -> Argument:
     return Argument(kind, ndim, rows=rows or {}, of=of)
+
+
+def _lanes(kind: str, ndim: int, rows: Mapping[str, str] | None = None, of: str = "") -> Argument:
+    return Argument(kind, ndim, LANES, rows or {}, of)
 
 
 def _vectors(
@@ -345,6 +378,10 @@ ARGUMENTS = {
     "mode_amounts": _vectors(1),  # amounts of the modes, MODE_VECTORS for each slice
     "mode_amount": _numbers("real", 1),  # the memory of mode_amounts, by mode
     "unit_need_m3s": _numbers("f64", 1),  # supply air that a chunk demands from each unit
+    "unit_plain_m3s": _numbers("f64", 1),  # the same at the exhaust shares of the design point
+    "plenum_shares": _lanes("f64", 1),  # unit_shares in f64, of halls whose units are coupled
+    "plenum_need": _lanes("f64", 2, PLENUM_NEED, "plenum"),
+    "unit_lanes": _lanes("f64", 1),  # air that racks take from each unit, by lane
     "chunk_sums": _numbers("f64", 1, SUMS, "chunks"),
     "group_values": _vectors(2, GROUP_OUT, "values"),
     # Results.
@@ -368,7 +405,8 @@ _STEP_ALONE = (
     *("run_offsets", "run_ints", "unit_inputs", "mix_weights", "run_weights", "steady_states"),
     *("sample_outlet_c", "mode_amounts", "mode_amount"),
     *("dc_control", "rack_state_by_4", "rack_state_by_16", "server_c_before", "server_c_after"),
-    *("scratch", "unit_need_m3s", "chunk_sums", "dc_out"),
+    *("scratch", "unit_need_m3s", "unit_plain_m3s", "plenum_shares", "plenum_need", "unit_lanes"),
+    *("chunk_sums", "dc_out"),
 )
 STEP_ARGUMENTS = {name: ARGUMENTS[name] for name in ARGUMENTS if name not in _LAYERS_ALONE}
 """Arguments of the kernel of a step (hall.py)."""

@@ -14,11 +14,9 @@ from .hall_arguments import (
     LANES,
     LAYERS_ARGUMENTS,
     PLACE_INTS,
-    UNIT_STATE,
 )
 from .servers import OUTLET_OF_SERVERS, compute_group, intake_air, rack_model, server_model
 
-FRESH_RATIO_USED = row_index(UNIT_STATE, "fresh_ratio_used")
 FIRST_GROUP, FIRST_SERVER = (row_index(PLACE_INTS, name) for name in PLACE_INTS)
 
 
@@ -143,7 +141,7 @@ def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.templat
     n_values = hall.place_ints[offset_row, place_1] - hall.place_ints[offset_row, place_0]
     in_runs = n_values > n_groups
     racks = rack_model(hall, servers, block_at)
-    air = intake_air(hall, n, block_at, block.mixed_c, FRESH_RATIO_USED)
+    air = intake_air(hall, n, block_at, block.mixed_c, True)
     # One pass computes all racks of the block, or each pass computes one rack.
     passes, row, n_vectors, rack = 1, block.first_row, block.groups, 0
     if not in_runs:

@@ -4,9 +4,8 @@ from typing import no_type_check
 
 import taichi as ti
 
-from .arguments import row_index
 from .compiler.functions import larger, smaller
-from .hall_arguments import LANES, RECOMMENDED_C, UNIT_STATE
+from .hall_arguments import LANES, RECOMMENDED_C
 from .mixes import store_exhaust
 from .servers import (
     OUTLET_OF_SERVERS,
@@ -26,8 +25,6 @@ from .servers import (
     zero_rack_sums,
 )
 from .sums import rank
-
-FRESH_RATIO = row_index(UNIT_STATE, "fresh_ratio")
 
 
 @ti.func
@@ -93,7 +90,7 @@ def compute_block(
             load_server_temperatures(hall, block_at)
     elif ti.static(hall.recirculates):
         mixed_c = block.mixed_c
-    air = intake_air(hall, n, block_at, mixed_c, FRESH_RATIO)
+    air = intake_air(hall, n, block_at, mixed_c, False)
     racks = rack_model(hall, servers, block_at)
     outlets = outlet_model(hall, n, servers, racks)
     sums, extremes = zero_rack_sums(hall), no_extremes(hall)
@@ -123,7 +120,7 @@ def compute_block(
         # This is `x = x + y`, because `x += y` would be an atomic operation.
         terms.return_m3k_s = terms.return_m3k_s + return_m3k_s
         block.captured_m3s = captured_m3s
-        block_terms.fresh_m3s = fresh_m3s
+        store_need(hall, n, block_at, block_terms_at, racks, air, sums, fresh_m3s)
         exhaust_c = outlet_c
         if ti.static(hall.transient):
             # Air at inlet temperature passes a rack that is off, except for a small draught.
@@ -155,6 +152,32 @@ def compute_block(
         outlet_max_c=outlet_max_c,
     )
     store_racks(hall, block_at, sweep, results)
+
+
+@ti.func
+@no_type_check
+def store_need(
+    hall: ti.template(),
+    n,
+    block_at,
+    block_terms_at,
+    racks: ti.template(),
+    air: ti.template(),
+    sums: ti.template(),
+    fresh_m3s,
+):
+    """Store the supply air that the racks of a block need, for the sums of the CRAC units."""
+    dc, block, block_terms = hall.dcs[n], hall.blocks[block_at], hall.block_terms[block_terms_at]
+    plain_m3s = fresh_m3s
+    if dc.exceeds > 0.0:
+        plain_m3s = sums.flow_m3s - block.exhaust_share * (sums.height_m3s * racks.full_m3s)
+        block_terms.plain_m3s = plain_m3s * air.per_total
+    block_terms.fresh_m3s = fresh_m3s * air.per_total
+    if dc.coupling > 0.0 and dc.follows_need > 0.0:
+        need_m3s = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+        for i in range(LANES):
+            need_m3s[i] = ti.cast(plain_m3s[i], ti.f64)
+        hall.plenum[block_at].present_m3s = need_m3s
 
 
 @ti.func

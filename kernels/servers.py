@@ -95,26 +95,55 @@ def first_share_at(hall: ti.template(), n, block_at):
 
 @ti.func
 @no_type_check
-def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
+def intake_air(hall: ti.template(), n, block_at, mixed_c, of_last: ti.template()):
     """Return the intake air of the racks of a block, from the exhaust mix before them in C.
 
     With inlet model ``approach`` it is supply air plus the rack's approach temperature. With
-    ``recirculation`` it is T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix).
-    ``fresh_ratio`` is the row of the units that contains f.
+    ``recirculation`` it is T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix). Weights of
+    the units change the shares to s_jk u_k / sum_l s_jl u_l, and units that deliver more than
+    their racks need lower r_j to r_j exp(-kappa max(0, eta_j - 1)) with eta_j = sum_k s_jk eta_k.
+    ``of_last``: the last sweep had this intake air; otherwise the present sweep has it.
     """
     block, dc = hall.blocks[block_at], hall.dcs[n]
     unit_0 = dc.first_unit
     cover, fresh_k, exhaust_share = hall.zeros, hall.zeros, hall.zeros
+    per_total = hall.zeros + hall.real(1.0)
     if ti.static(hall.recirculates):
         exhaust_share = block.exhaust_share
         n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_at(hall, n, block_at)
-        unit = 0
+        weighs, exceeds = dc.weighs > 0.0, dc.exceeds > 0.0
+        if ti.static(of_last):
+            weighs, exceeds = dc.weighs_used > 0.0, dc.exceeds_used > 0.0
+        total, supply_ratio, unit = hall.zeros, hall.zeros, 0
         while unit < n_units:
-            f = ti.cast(hall.unit_state[fresh_ratio, unit_0 + unit], hall.real)
-            part = hall.unit_shares[share_0 + unit] * f
+            at = unit_0 + unit
+            share, f = hall.unit_shares[share_0 + unit], hall.units[at].fresh_ratio
+            if ti.static(of_last):
+                f = hall.units[at].fresh_ratio_used
+            if weighs:
+                strength = hall.units[at].strength
+                if ti.static(of_last):
+                    strength = hall.units[at].strength_used
+                share *= ti.cast(strength, hall.real)
+                total += share
+            part = share * ti.cast(f, hall.real)
             cover += part
-            fresh_k += part * ti.cast(hall.units[unit_0 + unit].supply_c, hall.real)
+            fresh_k += part * ti.cast(hall.units[at].supply_c, hall.real)
+            if exceeds:
+                ratio = hall.units[at].supply_ratio
+                if ti.static(of_last):
+                    ratio = hall.units[at].supply_ratio_used
+                supply_ratio += share * ti.cast(ratio, hall.real)
             unit += hall.one
+        if weighs:
+            # Padding has no shares.
+            per_total = per_total / larger(total, hall.zeros + hall.real(1e-30))
+            cover *= per_total
+            fresh_k *= per_total
+            supply_ratio *= per_total
+        if exceeds:
+            excess = larger(supply_ratio - hall.real(1.0), hall.zeros)
+            exhaust_share *= hall.exp_of(excess * ti.cast(-dc.oversupply, hall.real))
         fresh_k = fresh_k - cover * mixed_c
     else:
         mixed_c = block.approach_k + ti.cast(hall.units[unit_0].supply_c, hall.real)
@@ -122,6 +151,7 @@ def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
         mixed_c=mixed_c,
         # sum_k s_jk f_k.
         cover=cover,
+        per_total=per_total,
         exhaust_share=exhaust_share,
         # sum_k s_jk f_k (T_sup,k - T_mix).
         fresh_k=fresh_k,

@@ -4,8 +4,9 @@ from typing import no_type_check
 
 import taichi as ti
 
+from .compiler.functions import larger
 from .decay import halvings_for, phi1, power_of_half
-from .hall_arguments import N_BLOCK_TERMS
+from .hall_arguments import COVERED_WITHIN, LANES, MOST_SUPPLY_RATIO, N_BLOCK_TERMS
 from .servers import first_share_at
 from .sums import sum_lanes
 
@@ -24,9 +25,13 @@ COIL_PART, CASING_PART = 4.0, 0.25
 changes of the air of the hall."""
 SHORT_OF_AIR = 20.0
 """Factor by which changes of the air count more where units do not cover the need of the racks."""
-COVERED_WITHIN = 1e-6
-"""Share of their need that units may seem to lack although they cover it. At the design point units
-deliver just what racks need."""
+WEIGHT_WITHIN, LEAST_WEIGHT = 1e-9, 1e-12
+"""Relative change at which weights of units are fitted, and smallest weight."""
+MOST_WEIGHT_PASSES, WEIGHT_PRODUCTS, LEAST_WEIGHT_PASSES = 300, 2e8, 20
+"""Maximum number of passes over the weights of a data center; if these are more than so many
+products of share and weight, the number of passes for it, but at least the last number."""
+WEIGHTS_EXTRAPOLATED_EVERY = 4
+"""Period in passes by which weights that approach their limit slowly are extrapolated."""
 MOST_PASSES = 100
 """Maximum number of passes over the coils of a data center; each pass may saturate a coil."""
 
@@ -45,19 +50,208 @@ def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
             share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
             need_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].fresh_m3s
             b += hall.one
-        hall.unit_need_m3s[chunk.first_need + unit] = sum_lanes(need_m3s)
+        strength = hall.units[dc.first_unit + unit].strength
+        hall.unit_need_m3s[chunk.first_need + unit] = strength * sum_lanes(need_m3s)
+        if dc.exceeds > 0.0:
+            plain_m3s, b = hall.zeros, 0
+            while b < n_blocks:
+                share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
+                plain_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].plain_m3s
+                b += hall.one
+            hall.unit_plain_m3s[chunk.first_need + unit] = strength * sum_lanes(plain_m3s)
         unit += hall.one
 
 
 @ti.func
 @no_type_check
 def unit_need(hall: ti.template(), n, unit):
-    """Return the supply air that all chunks of a data center need of one unit, in m3/s."""
+    """Return the supply air that all chunks of a data center need of one unit, in m3/s.
+
+    The second value is the need at the exhaust shares of the design point.
+    """
     chunk_at, need_m3s = hall.dcs[n].first_chunk, ti.cast(0.0, ti.f64)
     while chunk_at < hall.dcs[n + 1].first_chunk:
         need_m3s += hall.unit_need_m3s[hall.chunks[chunk_at].first_need + unit]
         chunk_at += hall.one
-    return need_m3s
+    plain_m3s = need_m3s
+    if hall.dcs[n].exceeds > 0.0:
+        plain_m3s = 0.0
+        chunk_at = hall.dcs[n].first_chunk
+        while chunk_at < hall.dcs[n + 1].first_chunk:
+            plain_m3s += hall.unit_plain_m3s[hall.chunks[chunk_at].first_need + unit]
+            chunk_at += hall.one
+    return need_m3s, plain_m3s
+
+
+@ti.func
+@no_type_check
+def take_from_units(hall: ti.template(), n, of_design):
+    """Add up, lane by lane, what racks take from each unit per weight of the unit, in m3/s."""
+    dc, unit = hall.dcs[n], 0
+    none = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+    n_units = hall.dcs[n + 1].first_unit - dc.first_unit
+    while unit < n_units:
+        hall.unit_lanes[dc.first_unit + unit] = none
+        unit += hall.one
+    block_at = hall.chunks[dc.first_chunk].first_block
+    while block_at < hall.chunks[hall.dcs[n + 1].first_chunk].first_block:
+        share_0, total, unit = first_share_at(hall, n, block_at), none, 0
+        while unit < n_units:
+            total += hall.plenum_shares[share_0 + unit] * hall.units[dc.first_unit + unit].weight
+            unit += hall.one
+        need_m3s = hall.plenum[block_at].present_m3s
+        if of_design:
+            need_m3s = hall.plenum[block_at].design_m3s
+        per_total = need_m3s / larger(total, none + ti.cast(1e-30, ti.f64))
+        unit = 0
+        while unit < n_units:
+            at = dc.first_unit + unit
+            taken_m3s = hall.plenum_shares[share_0 + unit] * per_total
+            hall.unit_lanes[at] = hall.unit_lanes[at] + taken_m3s
+            unit += hall.one
+        block_at += hall.one
+
+
+@ti.func
+@no_type_check
+def fit_weights(hall: ti.template(), n, of_design, need_m3s):
+    """Fit the weights of units that share a plenum to what they deliver.
+
+    Each pass multiplies the weight of a unit by what it delivers divided by what racks take from it
+    (Deming and Stephan 1940, see ``sdc_taichi.hall.unit_supply``). Where speeds are given, only the
+    ratios of the airflows count. Where fans follow the racks, a fan within its range holds a
+    constant pressure, weight 1, and only units at the ends of their ranges deliver a given airflow.
+
+    Args:
+        hall: arguments of the hall kernel.
+        n: index of the data center.
+        of_design: True to fit to the need of the racks at the design point.
+        need_m3s: need of all racks to which that need is scaled, in m3/s; 0 does not scale it.
+    """
+    dc, end_unit = hall.dcs[n], hall.dcs[n + 1].first_unit
+    follows, fresh_share = dc.follows_need > 0.0, ti.cast(dc.fresh_share, ti.f64)
+    products = ti.cast(dc.racks, ti.f64) * ti.cast(end_unit - dc.first_unit, ti.f64)
+    most_passes = ti.max(WEIGHT_PRODUCTS / products, ti.cast(LEAST_WEIGHT_PASSES, ti.f64))
+    most_passes = ti.min(most_passes, ti.cast(MOST_WEIGHT_PASSES, ti.f64))
+    passes, change = ti.cast(0.0, ti.f64), ti.cast(1.0, ti.f64)
+    while passes < most_passes and change > WEIGHT_WITHIN:
+        take_from_units(hall, n, of_design)
+        total, flow_m3s = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        at = dc.first_unit
+        while at < end_unit:
+            unit = hall.units[at]
+            taken_m3s = unit.weight * sum_lanes(hall.unit_lanes[at])
+            unit.taken_m3s = taken_m3s
+            total += taken_m3s
+            flow_m3s += ti.cast(unit.design_m3s, ti.f64) * unit.speed
+            at += hall.one
+        scale = ti.cast(1.0, ti.f64)
+        if not follows:
+            scale = flow_m3s / ti.max(total, 1e-30)
+        elif need_m3s > 0.0:
+            scale = need_m3s / ti.max(total, 1e-30)
+        least, most = ti.cast(1e30, ti.f64), ti.cast(0.0, ti.f64)
+        at = dc.first_unit
+        while at < end_unit:
+            unit = hall.units[at]
+            design_m3s = ti.cast(unit.design_m3s, ti.f64)
+            low_m3s = design_m3s * unit.speed
+            high_m3s = low_m3s
+            if follows:
+                low_m3s = fresh_share * design_m3s * ti.cast(unit.low, ti.f64)
+                high_m3s = fresh_share * design_m3s * ti.cast(unit.high, ti.f64)
+            per_m3s = unit.weight / ti.max(scale * unit.taken_m3s, 1e-30)
+            weight = ti.min(ti.max(low_m3s * per_m3s, 1.0), high_m3s * per_m3s)
+            least, most = ti.min(least, weight), ti.max(most, weight)
+            unit.taken_m3s = weight
+            at += hall.one
+        # Only the ratios of the weights count, unless a fan within its range has weight 1.
+        norm = ti.cast(1.0, ti.f64)
+        if not follows or most < 1.0:
+            norm = 1.0 / ti.max(most, LEAST_WEIGHT)
+        elif least > 1.0:
+            norm = 1.0 / least
+        product, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        change, at = ti.cast(0.0, ti.f64), dc.first_unit
+        while at < end_unit:
+            unit = hall.units[at]
+            weight = ti.max(norm * unit.taken_m3s, LEAST_WEIGHT)
+            weight_change = weight / unit.weight - 1.0
+            change = ti.max(change, ti.abs(weight_change))
+            product += weight_change * unit.last_weight_change
+            square += unit.last_weight_change * unit.last_weight_change
+            unit.last_weight_change = weight_change
+            unit.weight = weight
+            at += hall.one
+        passes += 1.0
+        is_due = ti.cast(passes, ti.i32) % WEIGHTS_EXTRAPOLATED_EVERY == 0
+        if is_due and change > WEIGHT_WITHIN and product > 0.2 * square and product < square:
+            share = ti.min(product / (square - product), 50.0)
+            at = dc.first_unit
+            while at < end_unit:
+                unit = hall.units[at]
+                further = ti.pow(1.0 + unit.last_weight_change, share)
+                unit.weight = unit.weight * ti.min(ti.max(further, 0.3), 3.0)
+                at += hall.one
+
+
+@ti.func
+@no_type_check
+def weigh_units(hall: ti.template(), n, begins: ti.template()):
+    """Update the weights of units that share a plenum; return the largest change of a strength.
+
+    Weights at given speeds depend on nothing but these speeds, so they are kept while these are the
+    same. ``begins``: the step begins, so the racks' need is that of the design point.
+    """
+    dc, end_unit = hall.dcs[n], hall.dcs[n + 1].first_unit
+    follows, fresh_share = dc.follows_need > 0.0, ti.cast(dc.fresh_share, ti.f64)
+    need_m3s, is_due, at = ti.cast(0.0, ti.f64), False, dc.first_unit
+    while at < end_unit:
+        unit = hall.units[at]
+        low, high = ti.cast(unit.low, ti.f64), ti.cast(unit.high, ti.f64)
+        design_m3s = ti.cast(unit.design_m3s, ti.f64)
+        if ti.static(begins):
+            if follows:
+                unit.weight = 1.0
+            if ti.static(hall.transient):
+                need_m3s += unit.plain_m3s
+            else:
+                unit.speed = ti.min(ti.max(dc.fan_speed, low), high)
+        if follows:
+            wanted = unit.plain_m3s / ti.max(fresh_share * design_m3s, 1e-30)
+            outside = wanted < low - WEIGHT_WITHIN or wanted > high + WEIGHT_WITHIN
+            if ti.static(begins and not hall.transient):
+                outside = low == high
+            if outside or unit.weight != 1.0:
+                is_due = True
+        elif unit.fitted_m3s != design_m3s * unit.speed:
+            is_due = True
+        at += hall.one
+    if is_due:
+        at = dc.first_unit
+        while at < end_unit:
+            unit = hall.units[at]
+            unit.last_weight_change = 0.0
+            unit.fitted_m3s = ti.cast(unit.design_m3s, ti.f64) * unit.speed
+            if not follows:
+                unit.weight = 1.0
+            at += hall.one
+        of_design = not follows
+        if ti.static(begins):
+            of_design = True
+        fit_weights(hall, n, of_design, need_m3s)
+    change, weighs = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    at = dc.first_unit
+    while at < end_unit:
+        unit = hall.units[at]
+        strength = ti.pow(unit.weight, dc.coupling)
+        change = ti.max(change, ti.abs(strength / unit.strength - 1.0))
+        if strength != 1.0:
+            weighs = ti.cast(1.0, ti.f64)
+        unit.strength = strength
+        at += hall.one
+    dc.weighs = weighs
+    return change
 
 
 @ti.func
@@ -111,9 +305,10 @@ def change_of_air(hall: ti.template(), n, least_exhaust_k, most_exhaust_k):
 def run_crac_units(hall: ti.template(), n, is_last):
     """Set the airflow of the CRAC units to the need of the racks, and the share of it they cover.
 
-    Each unit: V_k = clip(need_k / (1 - b_0), low V_k,full, high V_k,full) and
-    f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: this is the last sweep, so the state of the
-    units is that at the end of the step.
+    Each unit: V_k = clip(need_k / (1 - b_0), low V_k,full, high V_k,full) with the need at the
+    exhaust shares r_j of the design point, eta_k = (1 - b_0) V_k / need_k, and with the need at
+    present exhaust shares f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: this is the last
+    sweep, so the state of the units is that at the end of the step.
     """
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
     units = ti.Struct(
@@ -131,17 +326,17 @@ def run_crac_units(hall: ti.template(), n, is_last):
         running_casings_w=none,
     )
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
-    fresh_share = ti.cast(dc.fresh_share, ti.f64)
+    fresh_share, exceeds = ti.cast(dc.fresh_share, ti.f64), none
     at = dc.first_unit
     while at < hall.dcs[n + 1].first_unit:
         unit = hall.units[at]
-        need = unit_need(hall, n, at - dc.first_unit)
+        need, plain = unit_need(hall, n, at - dc.first_unit)
         low, high = ti.cast(unit.low, ti.f64), ti.cast(unit.high, ti.f64)
         design_m3s = ti.cast(unit.design_m3s, ti.f64)
         is_running = ti.cast(unit.running, ti.f64)
         f_used, supply_c = unit.fresh_ratio, unit.supply_c
         mean_supply_c = supply_c
-        following = need / ti.max(fresh_share * design_m3s, 1e-30)
+        following = plain / ti.max(fresh_share * design_m3s, 1e-30)
         if dc.inlet_target_c > 0.0:
             following = dc.fan_speed
         speed = ti.min(ti.max(following, low), high)
@@ -152,6 +347,14 @@ def run_crac_units(hall: ti.template(), n, is_last):
         f = ti.min(1.0, fresh_share * flow / ti.max(need, 1e-30))
         units.most_f_change = ti.max(units.most_f_change, ti.abs(f - f_used))
         unit.fresh_ratio = f
+        ratio_used = unit.supply_ratio
+        ratio = ti.min(fresh_share * flow / ti.max(plain, 1e-30), MOST_SUPPLY_RATIO)
+        unit.supply_ratio = ratio
+        if dc.oversupply > 0.0 and ratio > 1.0 + COVERED_WITHIN:
+            exceeds = ti.cast(1.0, ti.f64)
+        if dc.oversupply > 0.0 and ti.max(ratio, ratio_used) > 1.0 + COVERED_WITHIN:
+            change = dc.oversupply * ti.abs(ratio - ratio_used)
+            units.most_f_change = ti.max(units.most_f_change, change)
         cubed = speed * speed * speed * is_running
         units.fan_m3s += cubed * design_m3s
         units.running_m3s += is_running * flow
@@ -175,11 +378,19 @@ def run_crac_units(hall: ti.template(), n, is_last):
             unit.following = following
         if is_last or ti.static(not hall.transient):
             unit.fresh_ratio_used = f_used
+            unit.supply_ratio_used = ratio_used
+            unit.strength_used = unit.strength
+        unit.plain_m3s = plain
         unit.flow_m3s = flow
         unit.cubed_speed = cubed
         unit.speed = speed
         unit.mean_supply_c = mean_supply_c
         at += hall.one
+    dc.exceeds_used, dc.weighs_used = dc.exceeds, dc.weighs
+    dc.exceeds = exceeds
+    if dc.coupling > 0.0 and not is_last:
+        change = weigh_units(hall, n, False)
+        units.most_f_change = ti.max(units.most_f_change, change)
     return units
 
 

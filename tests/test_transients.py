@@ -72,12 +72,15 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
     real = np.float64 if precision == "f64" else np.float32
     assert fleet.air is not None
     groups = fleet.groups
+    need_m3s = fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units)
     return HallState(
         server_c=rng.uniform(22, 50, groups).astype(real),
         mixed_c=rng.uniform(20, 40, fleet.racks).astype(real),
         exhaust_c=(fleet.air.mix_weights.strength * rng.uniform(25, 45, fleet.racks)).astype(real),
         captured_m3s=rng.uniform(0, 1, fleet.racks).astype(real),
-        need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
+        need_m3s=need_m3s,
+        # No unit of these halls lowers exhaust shares.
+        plain_m3s=need_m3s,
         following=rng.uniform(0.2, 1.1, fleet.units),
         supply_excess_k=rng.uniform(0.0, 3.0, fleet.units),
         casing_c=rng.uniform(16, 40, fleet.units),
@@ -521,7 +524,7 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     layers = batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(fleet_of(config), precision)
-        of_units = "need_m3s", "following", "supply_excess_k", "casing_c"
+        of_units = "need_m3s", "plain_m3s", "following", "supply_excess_k", "casing_c"
         of_dc = "return_air_c", "water_heat_j", "tank_heat_j"
         where = {"server_c": part.groups} | dict.fromkeys(of_dc, slice(i, i + 1))
         where |= dict.fromkeys(of_units, part.units)

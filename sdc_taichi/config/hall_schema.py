@@ -117,6 +117,9 @@ class RecirculationConfig(Section):
     layout; None uses the layout."""
     matrix_kind: Literal["R", "D"] | None = None
     """Kind of the matrix in a .csv file; None for .npz files, which contain the kind."""
+    oversupply_decay: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Decay of the exhaust shares with oversupply: supply air of a multiple 1 + x of the need of a
+    rack lowers its exhaust share by exp(-x times this value), 0..20; 0 leaves it unchanged."""
     calibrate: Literal["rack", "row", "hall", "none"] | None = None
     """Approach temperatures to which recirculation is scaled: those of each ``rack``, or the means
     of each ``row`` or of the ``hall``, within which racks differ by the layout or the matrix file.

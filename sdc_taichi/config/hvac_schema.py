@@ -127,6 +127,10 @@ class CracConfig(Section):
     row sums to 1; None computes shares from distances."""
     supply_length_m: LengthM = 6.0
     """Distance at which the weight of a unit in the supply of a rack falls to 1/e, in m."""
+    plenum_coupling: Share = 0.0
+    """Coupling of the units by the plenum under a raised floor, 0..1: with 1 it has one pressure,
+    so that racks draw from each unit in proportion to its airflow; with 0 each unit keeps its
+    share in the supply of each rack while all units run."""
     capacity_kw: UnitCapacity | tuple[UnitCapacity, ...] | None = None
     """Largest heat that the coil of a unit removes, including the heat of its fan, in kW: one value
     for all units, or one per unit; None means that only the plant limits it."""
@@ -187,6 +191,11 @@ class CracConfig(Section):
                     "value for all"
                 )
         return self
+
+    @property
+    def coupling(self) -> float:
+        """Coupling of the units by the plenum, 0..1; a single unit has none."""
+        return self.plenum_coupling if self.units > 1 else 0.0
 
     @property
     def sized_by_need(self) -> bool:

@@ -35,7 +35,7 @@ STATE_AXES = {
     **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),
     **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
     **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
-    **dict.fromkeys(("need_m3s", "following", "supply_excess_k", "casing_c"), "U"),
+    **dict.fromkeys(("need_m3s", "plain_m3s", "following", "supply_excess_k", "casing_c"), "U"),
 }
 """First axes of the fields of ``State``, except its seeds and its clock."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))

@@ -314,6 +314,10 @@ class SharedPlenum:
         units = slice(*fleet.unit_offsets[dc : dc + 2])
         at = slice(*fleet.air.unit_share_offsets[dc : dc + 2])
         runs = running[units]
+        some_down = bool(np.any(runs > 0) and np.any(runs == 0))
+        self._adjusts_supply[dc] = some_down or self._always_adjusts[dc]
+        if fleet.plenum_coupling[dc] > 0:
+            return  # The kernels weigh the units by their airflow, whichever run.
         shares = fleet.air.unit_shares[at].reshape(-1, len(runs))
         key = int(fleet.air.steady_state_of_dc[dc]), runs.tobytes()
         if key not in self._weights_of_set:
@@ -321,8 +325,6 @@ class SharedPlenum:
                 self._weights_of_set.clear()
             self._weights_of_set[key] = self._weights(dc, shares, runs)
         self.weight[units] = weight = self._weights_of_set[key]
-        some_down = bool(np.any(runs > 0) and np.any(runs == 0))
-        self._adjusts_supply[dc] = some_down or self._always_adjusts[dc]
         weighted = weighted_shares(shares, weight)
         need_m3s = fleet.air.rack_need_m3s[slice(*fleet.rack_offsets[dc : dc + 2])]
         drawn_m3s, of_all_m3s = need_m3s @ weighted, need_m3s @ shares

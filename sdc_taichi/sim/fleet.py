@@ -134,6 +134,11 @@ class Fleet:
     setpoint_over_supply_k: F64
     """Setpoint of the CRAC units minus their coldest supply temperature, in K, (B,): with control
     of the return air the design temperature rise from supply to return, else 0."""
+    plenum_coupling: F64
+    """Exponent of the weights by which the shares of the CRAC units in the racks' supply follow
+    their airflow, 0..1, (B,); 0 with a single unit."""
+    oversupply_decay: F64
+    """Decay of exhaust shares per excess of supply over need, dimensionless, (B,)."""
     air: HallAir | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
 
@@ -313,6 +318,10 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         design_flow_m3s=np.array([h.design_flow_m3s for h in halls]),
         unit_capacity_w=np.concatenate([_capacity_w(config) for config in listed]),
         setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
+        plenum_coupling=np.array(
+            [c.hvac.crac.plenum_coupling * (c.hvac.crac.units > 1) for c in listed]
+        ),
+        oversupply_decay=np.array([c.hall.recirculation.oversupply_decay for c in listed]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 

@@ -16,6 +16,7 @@ from sdc_taichi.hall.steady_modes import SteadyModes, extended_modes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.hall_arguments import (
+    COVERED_WITHIN,
     DC_COEFFICIENTS,
     DC_CONTROL,
     DC_OUT,
@@ -26,6 +27,7 @@ from sdc_taichi.kernels.hall_arguments import (
     LOADS_PER_GROUP,
     LOADS_PER_RACK,
     MODE_VECTORS,
+    MOST_SUPPLY_RATIO,
     NOT_CONVERGED,
     OUTLETS,
     RACK_OUT,
@@ -66,6 +68,9 @@ class HallState:
     """Recirculated air that each rack draws in, in m3/s, (R,)."""
     need_m3s: F64
     """Supply airflow that the racks would demand from each CRAC unit if all units ran, in m3/s,
+    (U,)."""
+    plain_m3s: F64
+    """The same at the exhaust shares of the design point, which oversupply does not lower, in m3/s,
     (U,)."""
     following: F64
     """Speed of fans that follow the hottest inlet, otherwise the speed at which each CRAC unit
@@ -283,6 +288,9 @@ class Hall:
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
         """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
         self._dc["feedback_gain"][:] = USUAL_GAIN
+        tasks = np.diff(tables.arrays["task_offsets"])
+        self._weighs_apart = len(tasks) > fleet.size and bool(np.any(fleet.plenum_coupling > 0))
+        """True if a call of its own weighs the CRAC units of data centers that are split."""
         self._sparse_dcs = sparse_halls(fleet)
         self._serial_groups = SERIAL_GROUPS
         """Problem size up to which kernels run on one thread, see ``SERIAL_GROUPS``."""
@@ -430,6 +438,7 @@ class Hall:
             "exhaust_c": (racks, rack_c * strength),
             "captured_m3s": (racks, 0.0),
             "need_m3s": (units, fleet.unit_design_m3s),
+            "plain_m3s": (units, fleet.unit_design_m3s),
             "following": (units, 1.0),
             "supply_excess_k": (units, 0.0),
             "casing_c": (units, mean_c[fleet.unit_dc]),
@@ -583,12 +592,15 @@ class Hall:
             self._places.put(self._memory[name], values)
         # Shares, and with them the demand on each unit, change when units stop or start.
         need_m3s = state.need_m3s * self._tables.plenum.drawn_ratio
+        plain_m3s = state.plain_m3s * self._tables.plenum.drawn_ratio
         follows_inlet = self._dc["inlet_target_c"][fleet.unit_dc] > 0.0
         following = np.where(
-            follows_inlet, state.following, need_m3s / np.maximum(self._fresh_m3s, 1e-30)
+            follows_inlet, state.following, plain_m3s / np.maximum(self._fresh_m3s, 1e-30)
         )
         speed = np.clip(following, self._unit["low"], self._unit["high"])
         covers = self._fresh_m3s * speed / np.maximum(need_m3s, 1e-30)
+        ratio = self._fresh_m3s * speed / np.maximum(plain_m3s, 1e-30)
+        exceeds = fleet.unit_sums(np.where(ratio > 1.0 + COVERED_WITHIN, 1.0, 0.0)) > 0
         room_j = coil.room_j - (state.water_heat_j + state.tank_heat_j)
         warmed_k = (room_j / coil.room_j_per_k)[fleet.unit_dc]
         coil_c = coil.setpoint_c + warmed_k + state.supply_excess_k
@@ -598,6 +610,8 @@ class Hall:
         coil_c = np.where(passes_return_air, state.return_air_c[fleet.unit_dc], coil_c)
         of_units = {
             "fresh_ratio": np.minimum(1.0, covers),
+            "supply_ratio": np.minimum(ratio, MOST_SUPPLY_RATIO),
+            "plain_m3s": plain_m3s,
             "speed": speed,
             "coil_c": coil_c,
             "supply_c": coil_c,
@@ -605,6 +619,7 @@ class Hall:
         }
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
         of_dcs = {
+            "exceeds": exceeds & (fleet.oversupply_decay > 0),
             "fan_speed": state.following[fleet.unit_offsets[:-1]],
             "crac_m3s_per_rack": flow_m3s / np.diff(fleet.rack_offsets),
             "room_j": room_j,
@@ -625,6 +640,8 @@ class Hall:
         """Set the conditions of a step in steady air, where CRAC units first cover all need."""
         self._set_conditions(conditions)
         self._unit_state["fresh_ratio"][:] = 1.0
+        self._unit_state["supply_ratio"][:] = 1.0
+        self._dc["exceeds"][:] = 0.0
         self._dc["fan_speed"][:] = 1.0
         self._begin_step(exchanges_before=0)
 
@@ -662,7 +679,8 @@ class Hall:
         entries, first = np.unique(air.steady_state_of_dc[self._sparse_dcs], return_index=True)
         dcs = dict(zip(entries.tolist(), self._sparse_dcs[first].tolist(), strict=True))
         modes: dict[int, SteadyModes] = {}
-        controls = [self._dc[name] for name in ("adjusts_supply", "inlet_target_c")]
+        names = "adjusts_supply", "inlet_target_c", "coupling", "oversupply"
+        controls = [self._dc[name] for name in names]
         usual = [row.copy() for row in controls]
         for row in controls:
             row[:] = 0.0
@@ -756,6 +774,8 @@ class Hall:
     def _run_sweeps(self, dc_out: F64, sweeps: int, **arguments: Any) -> None:
         """Call the kernel until every data center has converged or reached its last sweep."""
         status = self._control["status"]
+        if self._weighs_apart:
+            self._call_step_kernel(dc_out, sweeps=0, **arguments)
         while np.maximum.reduce(status) == RUNNING:
             self._call_step_kernel(dc_out, sweeps=sweeps, **arguments)
 
@@ -854,6 +874,7 @@ class Hall:
             exhaust_c=self._places.values_of_racks(self._exhaust()[None])[0],
             captured_m3s=self._places.values_of_racks(self._memory["captured_m3s"][None])[0],
             need_m3s=self._unit_state["need_m3s"] / self._tables.plenum.drawn_ratio,
+            plain_m3s=self._unit_state["plain_m3s"] / self._tables.plenum.drawn_ratio,
             following=self._unit_state["following"].copy(),
             supply_excess_k=self._unit_state["excess_k"].copy(),
             casing_c=self._unit_state["casing_c"].copy(),

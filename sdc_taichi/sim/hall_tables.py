@@ -33,6 +33,7 @@ from sdc_taichi.kernels.hall_arguments import (
     LANES,
     MIX_PATTERNS,
     MODE_VECTORS,
+    PLENUM_NEED,
     RACK_INPUTS,
     RACK_OUT,
     RACK_STATE,
@@ -108,6 +109,8 @@ class HallTables:
     """Length of arrays with one entry per block and group, such as ``server_c``."""
     slices: int
     """Number of slices into which the tasks are divided for the threads."""
+    units_per_dc: I32
+    """Number of CRAC units of each data center, (B,)."""
     plenum: SharedPlenum
     """Updates ``unit_shares`` when CRAC units stop or start."""
 
@@ -183,6 +186,8 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "mode_amounts": mode_amounts,
         "mode_amount": mode_amounts.reshape(-1),
         "unit_need_m3s": np.zeros(max(int(chunk_ints[2, -1]), 1)),
+        "unit_plain_m3s": np.zeros(max(int(chunk_ints[2, -1]), 1)),
+        **_build_plenum(fleet, places),
         "chunk_sums": np.zeros(len(SUMS) * n_chunks),
         "group_values": vectors(dtype, len(GROUP_OUT), slices * int(most_groups)),
         "rack_out": vectors(dtype, len(RACK_OUT), places.count // LANES),
@@ -190,10 +195,11 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     doubles = arrays["dc_doubles"]
     adjusts_supply = doubles[row_index(DC_DOUBLES, "adjusts_supply")]
     plenum = SharedPlenum(fleet, unit_shares, dc_ints["first_share"], LANES, adjusts_supply)
-    tables = HallTables(places, arrays, int(group_places), slices, plenum)
+    tables = HallTables(places, arrays, int(group_places), slices, units, plenum)
     tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
     tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
     tables.rows("unit_inputs")["casing_m3"][:] = CASING_S * fleet.unit_design_m3s
+    tables.rows("unit_state")["fitted_m3s"][:] = -1.0
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
 
@@ -391,16 +397,9 @@ def _build_air(
     air = fleet.air
     if air is None:
         return vectors(dtype, 1), vectors(dtype, 1, lanes=DENSE_LANES * LANES), first_mix_weight
-    shares, weights, first_of_entry, total = [], [], {}, 0
-    for dc, (racks, units) in enumerate(
-        zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
-    ):
+    shares, weights, first_of_entry, total = _shares_by_block(fleet, places), [], {}, 0
+    for dc, racks in enumerate(np.diff(fleet.rack_offsets)):
         n_places = int(places.blocks[dc]) * LANES
-        at = air.unit_share_offsets[dc]
-        shares_of_hall = air.unit_shares[at : at + racks * units].reshape(racks, units)
-        shares.append(shares_by_block(shares_of_hall, LANES))
-        # Sparse halls are padded with blocks of zeros to whole vectors of RUN_LANES.
-        shares.append(np.zeros((n_places // LANES * units - len(shares[-1]), LANES)))
         if racks > DENSE_RACKS:
             continue
         entry = int(air.steady_state_of_dc[dc])
@@ -419,6 +418,40 @@ def _build_air(
     if weights:
         mix_weights[:] = np.concatenate(weights)
     return unit_shares, mix_weights, first_mix_weight
+
+
+def _build_plenum(fleet: Fleet, places: RackPlaces) -> dict[str, Array]:
+    """Return unit shares by block in f64, and the racks' need, of halls whose units are coupled."""
+    air = fleet.air
+    if air is None or not np.any(fleet.plenum_coupling > 0):
+        need, shares, lanes = vectors(np.float64, len(PLENUM_NEED), 1), [np.zeros((1, LANES))], 1
+    else:
+        lanes = fleet.units
+        need = vectors(np.float64, len(PLENUM_NEED), places.count // LANES)
+        need.reshape(len(need), -1)[:, places.of_racks] = air.rack_need_m3s
+        shares = _shares_by_block(fleet, places)
+    plenum_shares = vectors(np.float64, sum(map(len, shares)))
+    plenum_shares[:] = np.concatenate(shares)
+    return {
+        "plenum_need": need,
+        "plenum_shares": plenum_shares,
+        "unit_lanes": vectors(np.float64, lanes),
+    }
+
+
+def _shares_by_block(fleet: Fleet, places: RackPlaces) -> list[Array]:
+    """Return the unit shares of all data centers by block, see ``shares_by_block``."""
+    assert fleet.air is not None
+    shares = []
+    for dc, (racks, units) in enumerate(
+        zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
+    ):
+        at = fleet.air.unit_share_offsets[dc]
+        of_hall = fleet.air.unit_shares[at : at + racks * units].reshape(racks, units)
+        shares.append(shares_by_block(of_hall, LANES))
+        # Sparse halls are padded with blocks of zeros to whole vectors of RUN_LANES.
+        shares.append(np.zeros((int(places.blocks[dc]) * units - len(shares[-1]), LANES)))
+    return shares
 
 
 def _dense_weights(fleet: Fleet, dc: int) -> F64:
@@ -584,6 +617,9 @@ def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
     dc["crac_fan_w_per_m3s"][:] = fleet.values("hvac.crac.fan_w_per_m3s")
     follows = fleet.models["crac_flow"] == "hottest_inlet"
     dc["inlet_target_c"][:] = fleet.values("hvac.crac.inlet_target_c") * follows
+    dc["coupling"][:] = fleet.plenum_coupling
+    dc["follows_need"][:] = fleet.models["crac_flow"] == "follow_servers"
+    dc["oversupply"][:] = fleet.oversupply_decay
     dc["inlet_band_k"][:] = fleet.values("hvac.crac.inlet_band_k")
     dc["least_speed"][:] = fleet.values("hvac.crac.min_flow_ratio")
     rise_k = fleet.setpoint_over_supply_k

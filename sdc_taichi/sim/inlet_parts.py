@@ -62,10 +62,16 @@ class IntakeAir:
     unit_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
     unit_weight: F64
-    """Weight of each CRAC unit in the supply of all racks, 0..1, (U,): 1 while all units run."""
+    """Weight of each CRAC unit in the supply of all racks, above 0, (U,): 1 where shares are those
+    of the layout."""
+    supply_ratio: F64
+    """Supply air of each CRAC unit that reaches racks, divided by their need at the exhaust shares
+    of the design point, (U,); 1 where no unit of the hall delivers more than that."""
 
 
-UNIT_FIELDS = ("setpoint_c", "supply_c", "fresh_ratio", "unit_m3s", "unit_weight")
+UNIT_FIELDS = (
+    *("setpoint_c", "supply_c", "fresh_ratio", "unit_m3s", "unit_weight", "supply_ratio"),
+)
 """Fields of ``IntakeAir`` with an entry per CRAC unit."""
 RACK_FIELDS = tuple(f.name for f in fields(IntakeAir) if f.name not in UNIT_FIELDS)
 """Fields of ``IntakeAir`` with an entry per rack."""
@@ -82,6 +88,7 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
     """
     out = dict(zip(RACK_OUT, rack_out.reshape(len(RACK_OUT), -1), strict=True))
     rack, unit = tables.rows("rack_inputs"), tables.rows("unit_state")
+    exceeds = np.repeat(tables.rows("dc_doubles")["exceeds_used"] > 0, tables.units_per_dc)
     strength = rack["strength"]
     rows = {
         "mixed_c": tables.rows("rack_state")["mixed_c"],
@@ -99,7 +106,8 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
         supply_c=unit["supply_c"].copy(),
         fresh_ratio=unit["fresh_ratio_used"].copy(),
         unit_m3s=unit["flow_m3s"].copy(),
-        unit_weight=tables.plenum.weight.copy(),
+        unit_weight=tables.plenum.weight * unit["strength_used"],
+        supply_ratio=np.where(exceeds, unit["supply_ratio_used"], 1.0),
     )
 
 
@@ -239,7 +247,9 @@ class Inlets:
             shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
             self._shares = weighted_shares(shares, air.unit_weight)
             racks = slice(self._first_rack, self._first_rack + self._racks)
-            self._exhaust_share = fleet.air.exhaust_share[racks]
+            excess = np.maximum(self._shares @ air.supply_ratio - 1.0, 0.0)
+            lowered = np.exp(-fleet.oversupply_decay[dc] * excess)
+            self._exhaust_share = fleet.air.exhaust_share[racks] * lowered
         self._group_inlet_c = self._group_inlets()
 
     def hottest(self, most: int) -> list[int]:

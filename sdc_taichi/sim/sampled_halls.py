@@ -85,6 +85,8 @@ def sampled_fleet(fleet: Fleet, dcs: I64, modes: Mapping[int, SteadyModes]) -> F
         design_flow_m3s=np.full(n, _UNIT_M3S),
         unit_capacity_w=np.full(n, NO_LIMIT_W),
         setpoint_over_supply_k=np.zeros(n),
+        plenum_coupling=np.zeros(n),
+        oversupply_decay=np.zeros(n),
         air=HallAir(
             mix_weights=_sample_weights([modes[e] for e in entries]),
             exhaust_share=air.exhaust_share[racks],
