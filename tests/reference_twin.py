@@ -257,7 +257,10 @@ class HallTwin:
 def heat_capacity_j_per_k(hall: HallTwin) -> F64:
     """Heat capacity of every server, (S,)."""
     given = hall.config.servers.heat_capacity_kj_per_k
-    return 30.0 * hall.full_w if given is None else np.full(len(hall.full_w), 1e3 * given)
+    if given is not None:
+        return np.full(len(hall.full_w), 1e3 * given)
+    of_rack = 30.0 * hall.per_rack(hall.full_w)
+    return 30.0 * hall.full_w * (np.minimum(of_rack, 410e3) / of_rack)[hall.rack]
 
 
 def path_lengths_m(hall: HallConfig) -> F64:

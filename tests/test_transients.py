@@ -676,3 +676,24 @@ def test_quasi_steady_halls_ignore_their_water_and_say_so() -> None:
             assert result.water_heat_kwh[0] == result.tank_heat_kwh[0] == 0.0
             found.append(float(result.hvac_w[0]))
     assert found == [found[0]] * 4
+
+
+def test_dense_halls_warm_faster_without_cooling() -> None:
+    # Dense racks are not heavier than others, and hold no more air.
+    event = "[{kind: crac_down, start_h: 0, duration_h: 1}]"
+    rates = []
+    for server_w in (25.0, 50.0, 138.5):
+        config = load_config(
+            "corrected",
+            ["simulation.thermal=transient", "simulation.steps_per_hour=60",
+             f"servers.power_w=[{server_w}, {server_w / 5}]", f"events.scheduled={event}"],
+        )  # fmt: skip
+        assert config.server_heat_capacity_kj_per_k * 200 == pytest.approx(
+            min(30e-3 * server_w * 200, 410.0)
+        )
+        with Simulator(config, drivers=constant_drivers(demand=1.0), precision="f64") as sim:
+            sim.reset()
+            inlet_c = [sim.step().inlet_mean_c[0] for _ in range(10)]
+        rates.append((inlet_c[9] - inlet_c[2]) / 7)
+    assert rates[0] < rates[1] < rates[2]
+    assert 1.5 * rates[0] < rates[2] < 3.0 * rates[0]

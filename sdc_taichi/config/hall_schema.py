@@ -37,6 +37,10 @@ SERVER_J_PER_K_W = 30.0
 """Heat capacity of servers divided by their power at full load, in J/(K W). The measured heat
 capacity of a two-unit server of about 400 W is 12 kJ/K (Ibrahim, Shrivastava, Sammakia, Ghose 2012,
 "Thermal mass characterization of a server at different fan speeds", ITherm)."""
+MOST_RACK_J_PER_K = 410e3
+"""Largest heat capacity of the servers of a rack, in J/K, unless it is configured: 42 units of 16.3
+kg at 0.6 kJ/(kg K), as of a server of 130.5 kg, 8 units and 10.2 kW (NVIDIA DGX H100). Servers that
+draw more power for their height are not heavier."""
 ROOM_J_PER_K_W = 15.0
 """Heat capacity of coils, water in the coils and raised floor, whose temperatures follow the supply
 air, divided by the servers' power at full load, in J/(K W)."""
@@ -480,7 +484,7 @@ class ServerConfig(Section):
     fit of the released SustainDC."""
     heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] | None = None
     """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal; None means 30
-    J/K per W of its power at full load."""
+    J/K per W of its power at full load, and at most 410 kJ/K for all servers of a rack."""
     heat_exchange_effectiveness: WorkingShare = 0.95
     """Effectiveness of the heat exchange between a server and the air that flows through it,
     0.01..1."""

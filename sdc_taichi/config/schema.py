@@ -28,6 +28,7 @@ from sdc_taichi.config.fields import (
     check_one_per_rack,
 )
 from sdc_taichi.config.hall_schema import (
+    MOST_RACK_J_PER_K,
     MOST_RACK_U,
     ROOM_J_PER_K_W,
     SERVER_J_PER_K_W,
@@ -349,7 +350,11 @@ class DataCenterConfig(Section):
     def server_heat_capacity_kj_per_k(self) -> float:
         """Mean heat capacity of one server of the hall, in kJ/K."""
         configured = self.servers.heat_capacity_kj_per_k
-        return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
+        if configured is not None:
+            return configured
+        by_power = SERVER_J_PER_K_W * self.rack_nameplate_w()
+        share = np.minimum(by_power, MOST_RACK_J_PER_K).sum() / by_power.sum()
+        return float(share) * SERVER_J_PER_K_W * self._mean_server_w() / 1e3
 
     @property
     def room_heat_capacity_kj_per_k(self) -> float:

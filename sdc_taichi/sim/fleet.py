@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.config.hall_schema import SERVER_J_PER_K_W
+from sdc_taichi.config.hall_schema import MOST_RACK_J_PER_K, SERVER_J_PER_K_W
 from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point, odd_airflow
@@ -495,7 +495,9 @@ def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers
     """Return the heat capacity of one server of each group, in J/K, (G,)."""
     kj_per_k = config.servers.heat_capacity_kj_per_k
     if kj_per_k is None:
-        return SERVER_J_PER_K_W * servers.full_w
+        rack_j_per_k = SERVER_J_PER_K_W * servers.per_rack(servers.count * servers.full_w)
+        scale = np.minimum(1.0, MOST_RACK_J_PER_K / np.maximum(rack_j_per_k, 1e-30))
+        return SERVER_J_PER_K_W * servers.full_w * servers.per_group(scale)
     return np.full(len(servers.full_w), 1e3 * kj_per_k)
 
 
