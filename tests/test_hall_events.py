@@ -155,7 +155,7 @@ def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
         [
             f"simulation.thermal={thermal}", "hvac.crac.units=2", "protection.ashrae_class=A1",
             f"protection.trip_margin_k={margin_k}", "protection.throttle_share=0.7",
-            "workload.queue_limit_h=0.01",
+            "workload.queue_limit_h=0.01", "servers.heat_capacity_kj_per_k=4.155",
             events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3"),
         ],
         48,
@@ -290,7 +290,8 @@ def test_a_rack_with_a_tenth_of_its_air_throttles_trips_and_waits_for_its_fans(
 ) -> None:
     results = simulate(
         [f"simulation.thermal={thermal}", f"simulation.steps_per_hour={per_hour}",
-         "servers.power_w=[150, 10]", "protection.ashrae_class=A2",
+         "servers.power_w=[150, 10]", "servers.heat_capacity_kj_per_k=4.5",
+         "protection.ashrae_class=A2",
          events("kind: rack_fan_failure, rack: 7, share: 0.1, start_h: 0.5, duration_h: 3")],
         5 * per_hour,
         constant(1.0),

@@ -248,9 +248,13 @@ def test_substeps_converge_to_the_differential_equations(low: float) -> None:
     assert np.all((ratios > 1.6) & (ratios < 2.6)), errors
 
 
+HEAVY_SERVERS = "servers.heat_capacity_kj_per_k=4.155"
+"""Servers that take six minutes to warm."""
+
+
 def breathing_supply_air(*overrides: str) -> DataCenterConfig:
     """Servers whose inlet is the supply air, whatever the others do."""
-    return load_config("corrected", ["hall.supply_approach_k=0", *overrides])
+    return load_config("corrected", ["hall.supply_approach_k=0", HEAVY_SERVERS, *overrides])
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -481,7 +485,7 @@ def test_air_in_a_dark_hall_stays_between_what_it_was(servers: int) -> None:
 
 
 def test_server_layers_are_those_of_the_end_of_the_step() -> None:
-    config = load_config("corrected", ["simulation.thermal=transient"])
+    config = load_config("corrected", ["simulation.thermal=transient", HEAVY_SERVERS])
     demand = np.repeat([0.2, 0.9], [2, 80])[None]
     with Simulator(config, drivers=constant_drivers(demand=demand), precision="f64") as sim:
         sim.reset()
@@ -570,7 +574,8 @@ def tripped_chillers(*events: str, names: Any = (*WATER,), steps: int = 90) -> A
         load_config(
             "corrected",
             ["simulation.thermal=transient", "simulation.steps_per_hour=60", "hvac.crac.units=4",
-             *WATER[name], f"name={name}", f"events.scheduled=[{', '.join(events)}]"],
+             "hvac.tower.economiser=false", *WATER[name], f"name={name}",
+             f"events.scheduled=[{', '.join(events)}]"],
         )
         for name in names
     ]  # fmt: skip
@@ -607,7 +612,7 @@ def test_water_takes_up_the_heat_of_a_chiller_that_trips_and_returns_it() -> Non
     stored_kwh = run["water_heat_kwh"] + run["tank_heat_kwh"]
     assert np.all(stored_kwh[29, 1:] > 10.0)
     assert np.all(run["heat_removed_w"][31, 1:] > run["cooling_load_w"][31, 1:] * 1.01)
-    assert np.all(run["room_heat_kwh"][-1] < 0.6 * run["room_heat_kwh"].max(axis=0))
+    assert np.all(run["room_heat_kwh"][-1] < 0.7 * run["room_heat_kwh"].max(axis=0))
     assert np.all(np.abs(run["room_heat_kwh"][-1, 2:]) < 1e-6)
 
 
