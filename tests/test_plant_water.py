@@ -89,9 +89,32 @@ def test_solids_are_conserved(heat_w: float, cycles: float, range_k: float) -> N
     np.testing.assert_allclose(result.evaporation_l * 2.45e6, heat_w * 900.0, rtol=1e-12)
 
 
-def test_evaporation_is_bounded_by_flow_and_range() -> None:
-    result = run("mass_balance", rejected_w=np.array([8e5, 2e6]), range_k=5.0, water_kg_s=40.0)
-    np.testing.assert_allclose(result.evaporation_l, [8e5 / 2.45e6 * 900.0, 0.002 * 5 * 40 * 900])
+def test_loss_factor_follows_flow_and_range() -> None:
+    """EnergyPlus: 0.2 % of the water flow for each kelvin, which is 1.17 times the heat."""
+    result = run("loss_factor", range_k=np.array([2.5, 5.0]), water_kg_s=40.0)
+    np.testing.assert_allclose(result.evaporation_l, [0.002 * 2.5 * 36e3, 0.002 * 5 * 36e3])
+    twice = run("loss_factor", range_k=5.0, water_kg_s=40.0, evaporation_per_k=0.004)
+    assert twice.evaporation_l == pytest.approx(2.0 * result.evaporation_l[1])
+    by_heat = run("mass_balance").evaporation_l
+    assert run("loss_factor").evaporation_l / by_heat == pytest.approx(0.002 * 2.45e6 / 4184.0)
+
+
+@pytest.mark.parametrize("airflow_m3s", [6.0, 13.0, 26.67])
+def test_evaporation_in_deep_frost_is_small_but_physical(airflow_m3s: float) -> None:
+    """Against saturated air by the equations of ASHRAE, down to the coldest weather on earth."""
+    wet_bulb_c = np.linspace(-60.0, -5.0, 56)
+    found = run("saturated_exit", wet_bulb_c=wet_bulb_c, outdoor_c=wet_bulb_c,
+                tower_airflow_m3s=airflow_m3s, dt_s=1.0)  # fmt: skip
+    grid_c = np.linspace(-65.0, 45.0, 20_001)
+    ratio = psychrometrics.humidity_ratio(grid_c, 100.0, 101_325.0)
+    enthalpy = np.asarray(moist_air.enthalpy_j_per_kg(grid_c, ratio))
+    entering = np.interp(wet_bulb_c, grid_c, ratio)
+    dry_air_kg_s = airflow_m3s * moist_air.dry_air_kg_m3(wet_bulb_c, entering, 101_325.0)
+    at = np.interp(wet_bulb_c, grid_c, enthalpy) + 1e6 / dry_air_kg_s
+    expected = dry_air_kg_s * (np.interp(at, enthalpy, ratio) - entering)
+    np.testing.assert_allclose(found.evaporation_l, expected, rtol=0.05, atol=2e-4)
+    assert np.all(found.evaporation_l > 0.0)
+    assert np.all(np.diff(found.evaporation_l) > 0.0)
 
 
 def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
@@ -101,9 +124,9 @@ def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
     assert result.water_l[1] == result.evaporation_l[1] + result.drift_l[1]
 
 
-@pytest.mark.parametrize("name", ["mass_balance", "saturated_exit"])
+@pytest.mark.parametrize("name", ["mass_balance", "saturated_exit", "loss_factor"])
 def test_idle_tower_only_drifts(name: str) -> None:
-    result = run(name, rejected_w=np.array([0.0, -1e5]), water_kg_s=50.0)
+    result = run(name, rejected_w=np.array([0.0, -1e5]), range_k=0.0, water_kg_s=50.0)
     np.testing.assert_allclose(result.water_l, 50.0 * 2e-5 * 900.0)
     np.testing.assert_array_equal(result.evaporation_l, 0.0)
 

@@ -28,7 +28,7 @@ from sdc_taichi.plant.chiller import CHILLERS, MIN_LIFT_K
 from sdc_taichi.plant.cooling import COOLING_LOADS, CRAC_FLOWS, SETPOINTS
 from sdc_taichi.plant.plants import PLANTS, default_chiller, fits, plant_of
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water import WATER
+from sdc_taichi.plant.water import EVAPORATION_PER_K, WATER
 from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
@@ -390,7 +390,11 @@ class WaterConfig(Section):
 
     model: Annotated[str, NameIn(WATER)] = "saturated_exit"
     """Water model of the tower: air that leaves the tower saturated, rejection of all heat by
-    evaporation, or the fits of the released SustainDC and of its paper."""
+    evaporation, a loss factor for each kelvin of range, or the fits of the released SustainDC and
+    of its paper."""
+    evaporation_per_k: Annotated[float, Field(ge=0, le=0.01)] = EVAPORATION_PER_K
+    """Loss factor of model ``loss_factor``: evaporation divided by the water flow of the tower, for
+    each kelvin of range, 0..0.01; all heat rejected by evaporation would be 0.0017."""
     cycles_of_concentration: Annotated[float, Field(ge=1.01, le=1000)] = 5.0
     """Concentration of solids in tower water divided by that in make-up water, 1.01..1,000: at the
     bounds, blowdown is 100 times and a thousandth of the evaporation."""

@@ -16,9 +16,9 @@ from sdc_taichi.types import Values, WaterQuantities
 
 EVAPORATION_HEAT_J_PER_KG = 2.45e6
 """Heat of evaporation of water near 20 C, in J/kg."""
-MAX_EVAPORATION_PER_K = 0.002
-"""Largest evaporation, as a share of the water flow, for each kelvin of range (EnergyPlus, "loss
-factor" evaporation)."""
+EVAPORATION_PER_K = 0.002
+"""Evaporation for each kelvin of range, as a share of the water flow: the usual loss factor, and
+the default of EnergyPlus."""
 PAPER_DRIFT_RATE = 0.01
 """Drift in the paper and its released code, as a share of the water use, not of the water flow."""
 
@@ -50,23 +50,36 @@ class WaterPoint(NamedTuple):
     """Drift as a share of the tower water flow, (B,)."""
     dt_s: Values
     """Length of the step, in s."""
+    evaporation_per_k: Values = EVAPORATION_PER_K
+    """Loss factor: evaporation for each kelvin of range, as a share of the water flow, (B,)."""
 
 
 def mass_balance(point: WaterPoint) -> WaterQuantities:
     """Compute evaporation, drift and blowdown with all heat rejected by evaporation.
 
-    This is an upper bound of evaporation, since in cold weather part of the heat leaves as warm
-    air. Evaporation is also limited to 0.2 % of the water flow for each kelvin of range. Blowdown
-    is evaporation/(cycles of concentration - 1) - drift, and at least 0 (EnergyPlus Engineering
-    Reference, tower make-up water).
+    In cold weather part of the heat leaves as warm air, and this model gives too much water; in hot
+    dry weather air brings heat of its own, and it gives too little. Blowdown is evaporation/(cycles
+    of concentration - 1) - drift, and at least 0 (EnergyPlus Engineering Reference, tower make-up
+    water).
     """
-    latent_kg_s = np.maximum(point.rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
-    evaporation_l = (
-        np.minimum(latent_kg_s, MAX_EVAPORATION_PER_K * point.range_k * point.water_kg_s)
-        * point.dt_s
-    )
     return _with_blowdown(
-        evaporation_l,
+        np.maximum(point.rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG * point.dt_s,
+        point.drift_share * point.water_kg_s * point.dt_s,
+        point.cycles_of_concentration,
+    )
+
+
+def loss_factor(point: WaterPoint) -> WaterQuantities:
+    """Compute evaporation, drift and blowdown with a loss factor for each kelvin of range.
+
+    Evaporation is factor * range * water flow (EnergyPlus Engineering Reference, tower make-up
+    water, "LossFactor"; its default factor is 0.2 % per kelvin). All heat rejected by evaporation
+    would be 0.17 % per kelvin, so the default is 17 % more than ``mass_balance``. Drift and
+    blowdown are those of ``mass_balance``.
+    """
+    range_k = np.maximum(point.range_k, 0.0)
+    return _with_blowdown(
+        point.evaporation_per_k * range_k * point.water_kg_s * point.dt_s,
         point.drift_share * point.water_kg_s * point.dt_s,
         point.cycles_of_concentration,
     )
@@ -127,6 +140,7 @@ def paper(point: WaterPoint) -> WaterQuantities:
 WATER: dict[str, Callable[[WaterPoint], WaterQuantities]] = {
     "saturated_exit": saturated_exit,
     "mass_balance": mass_balance,
+    "loss_factor": loss_factor,
     "released": released,
     "paper": paper,
 }

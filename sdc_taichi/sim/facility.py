@@ -24,6 +24,7 @@ from sdc_taichi.plant.electrical import NO_LIMIT_KW, ROUND_OFF_SHARE, overload_k
 from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterPoint
+from sdc_taichi.plant.water_side import coil_capacity_w
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.hall_solver import HallSums
@@ -119,6 +120,7 @@ class Facility:
         self._water = {
             "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
             "drift_share": v("hvac.water.drift_share"),
+            "evaporation_per_k": v("hvac.water.evaporation_per_k"),
             "pressure_pa": sites_pressure_pa(fleet),
         }
         self._flow_limits = {
@@ -147,12 +149,13 @@ class Facility:
         rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
         return_c = supply.plant_setpoint_c + rise_k
         plant = self._operate(capacity_w, surroundings, supply, return_c, flow_m3s)
-        pumped_w = self._sizing.water_side.pumped_w
+        design, powered = self._sizing.water_side, 1.0
         if not self._event_free:
-            pumped_w = pumped_w * surroundings.pump_share * surroundings.powered
+            design = replace(design, pumped_w=design.pumped_w * surroundings.pump_share)
+            powered = surroundings.powered
         return {
             "heat_removed_w": plant.heat_removed_w,
-            "carried_w": np.minimum(capacity_w, pumped_w),
+            "carried_w": np.minimum(capacity_w, coil_capacity_w(design) * powered),
         }
 
     def step(self, inputs: StepInputs) -> dict[str, F64]:
