@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sdc_taichi.types import Values
+from sdc_taichi.types import Values, as_array
 
 WATER_TO_DRY_AIR = 0.621945
 """Molar mass of water divided by that of dry air."""
@@ -60,7 +60,7 @@ def saturation_pa(temperature_c: Values) -> Values:
     """
     bounded_c = np.clip(temperature_c, *SATURATION_BOUNDS_C)
     a, b, c = _buck(bounded_c)
-    return _TRIPLE_PA * np.exp((a - c * bounded_c) * bounded_c / (b + bounded_c))
+    return as_array(_TRIPLE_PA * np.exp((a - c * bounded_c) * bounded_c / (b + bounded_c)))
 
 
 def saturated_ratio(temperature_c: Values, pressure_pa: Values) -> Values:

@@ -149,13 +149,14 @@ class Facility:
         rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
         return_c = supply.plant_setpoint_c + rise_k
         plant = self._operate(capacity_w, surroundings, supply, return_c, flow_m3s)
-        design, powered = self._sizing.water_side, 1.0
+        design = self._sizing.water_side
         if not self._event_free:
             design = replace(design, pumped_w=design.pumped_w * surroundings.pump_share)
-            powered = surroundings.powered
         return {
             "heat_removed_w": plant.heat_removed_w,
-            "carried_w": np.minimum(capacity_w, coil_capacity_w(design) * powered),
+            "carried_w": np.minimum(
+                capacity_w, self._while_powered(coil_capacity_w(design), surroundings)
+            ),
         }
 
     def step(self, inputs: StepInputs) -> dict[str, F64]:
