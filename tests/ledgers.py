@@ -81,8 +81,7 @@ def converted_kwh(run: Run, sign: float) -> F64:
     standby_kwh = run.fleet_values("battery.standby_per_h") * run.battery_kwh * run.step_h
     bus_kwh = run["charge_kwh"] - run["discharge_kwh"] - standby_kwh * run["grid_up"]
     square_per_kwh = run.fleet_values("battery.square_loss_h") / (run.battery_kwh * run.step_h)
-    # What rounding leaves of standby alone is no conversion.
-    moved_kwh = np.where(sign * bus_kwh > 1e-12 * run.battery_kwh, sign * bus_kwh, 0.0)
+    moved_kwh = np.maximum(sign * bus_kwh, 0.0)
     return np.asarray(moved_kwh - sign * square_per_kwh * moved_kwh**2)
 
 

@@ -76,7 +76,7 @@ def test_racks_of_8_and_30_kw_warm_their_air_alike(mixed: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::sdc_taichi.errors.OddInputWarning")
-@pytest.mark.parametrize("rack_kw", [60, 90, 132])
+@pytest.mark.parametrize("rack_kw", [100, 132])
 def test_racks_beyond_what_air_cools_are_refused_unless_asked_for(rack_kw: int) -> None:
     dense = [f"servers.power_w=[{rack_kw * 5}, 10]"]
     with pytest.raises(

@@ -299,9 +299,10 @@ class HallConfig(Section):
     """Dimensions of the hall."""
     most_face_velocity_m_s: Annotated[float, Field(ge=0.1, le=100)] | None = 2.5
     """Largest velocity of the air at the front of a rack at the design point, in m/s, 0.1..100:
-    airflow of its servers, at a temperature rise of 15 K or their own larger one, divided by
+    airflow of its servers, at a temperature rise of 25 K if they move more air, divided by
     ``layout.rack_pitch_m`` times ``layout.rack_height_m``. Racks that need more air are refused.
-    The default is 3.2 m3/s and 57 kW for a rack of 0.6 m; None allows any velocity."""
+    The default is 3.2 m3/s and 95 kW for a rack of 0.6 m, fans included; None allows any
+    velocity."""
     recirculation: RecirculationConfig = RecirculationConfig()
     """Recirculation of exhaust air, for inlet model ``recirculation``."""
     height_zones: Annotated[int, Field(ge=1, le=100)] = 5

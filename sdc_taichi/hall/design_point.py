@@ -26,9 +26,6 @@ reaches 67 C, the limit of components downstream of the processors."""
 MOST_USUAL_RISE_K = 25.0
 """Largest usual temperature rise of the air in a server at full load, in K. Most servers have 10 to
 20 K, the densest ones 25 K."""
-LEAST_DENSE_RISE_K = 15.0
-"""Smallest temperature rise of the air through racks at full load, in K, at which the velocity of
-the air at their fronts is judged."""
 MOST_USUAL_RTI_PCT = 200.0
 """Largest usual return temperature index, in %. Open halls without cold and hot aisles have about
 150 %."""
@@ -278,21 +275,21 @@ def odd_airflow(
 def _check_face_velocity(config: DataCenterConfig, design: DesignPoint) -> None:
     """Raise an error if a rack needs more air than passes its front.
 
-    Servers that move more air than ``LEAST_DENSE_RISE_K`` asks for could do with less, so they are
-    judged at this temperature rise. The densest racks that are cooled by air alone hold four
-    servers of 14.3 kW and 0.73 m3/s each (NVIDIA 2024, *DGX B200 User Guide*): 57 kW and 2.3 m/s
-    through a front of 0.6 m x 2.1 m.
+    Servers could do with less air if it became warmer, so racks are judged at the largest usual
+    temperature rise, ``MOST_USUAL_RISE_K``. The densest racks that are cooled by air alone hold
+    four servers of 14.3 kW and 0.73 m3/s each (NVIDIA 2024, *DGX B200 User Guide*): 57 kW and 2.3
+    m/s through a front of 0.6 m x 2.1 m.
     """
     most_m_s, layout = config.hall.most_face_velocity_m_s, config.hall.layout
     face_m2 = layout.rack_pitch_m * layout.rack_height_m
-    usual_m3s = design.it_w / (design.air_j_per_m3_k * LEAST_DENSE_RISE_K)
+    usual_m3s = design.it_w / (design.air_j_per_m3_k * MOST_USUAL_RISE_K)
     airflow_m3s = np.minimum(design.airflow_m3s, usual_m3s)
     rack = int(np.argmax(airflow_m3s))
     if most_m_s is None or airflow_m3s[rack] <= most_m_s * face_m2:
         return
     raise ConfigError(
         f"{config.name}: hall: rack {rack} with servers of {design.it_w[rack] / 1e3:.4g} kW needs "
-        f"{airflow_m3s[rack]:.3g} m3/s of air at the design point, "
+        f"{airflow_m3s[rack]:.3g} m3/s of air that warms by {MOST_USUAL_RISE_K:g} K, "
         f"{airflow_m3s[rack] / face_m2:.3g} m/s through its front of {layout.rack_pitch_m:g} x "
         f"{layout.rack_height_m:g} m; valid is at most {most_m_s:g} m/s "
         "(hall.most_face_velocity_m_s; null allows any velocity)"
