@@ -30,6 +30,8 @@ WEIGHT_WITHIN, LEAST_WEIGHT = 1e-9, 1e-12
 MOST_WEIGHT_PASSES, WEIGHT_PRODUCTS, LEAST_WEIGHT_PASSES = 300, 2e8, 20
 """Maximum number of passes over the weights of a data center; if these are more than so many
 products of share and weight, the number of passes for it, but at least the last number."""
+LEAST_NEED_M3S = 1e-6
+"""Need of all racks of a data center below which units have no weights, in m3/s."""
 WEIGHTS_EXTRAPOLATED_EVERY = 4
 """Period in passes by which weights that approach their limit slowly are extrapolated."""
 MOST_PASSES = 100
@@ -162,6 +164,8 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
                 high_m3s = fresh_share * design_m3s * ti.cast(unit.high, ti.f64)
             per_m3s = unit.weight / ti.max(scale * unit.taken_m3s, 1e-30)
             weight = ti.min(ti.max(low_m3s * per_m3s, 1.0), high_m3s * per_m3s)
+            if total < LEAST_NEED_M3S:
+                weight = ti.cast(1.0, ti.f64)
             least, most = ti.min(least, weight), ti.max(most, weight)
             unit.taken_m3s = weight
             at += hall.one
@@ -175,7 +179,7 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
         change, at = ti.cast(0.0, ti.f64), dc.first_unit
         while at < end_unit:
             unit = hall.units[at]
-            weight = ti.max(norm * unit.taken_m3s, LEAST_WEIGHT)
+            weight = ti.min(ti.max(norm * unit.taken_m3s, LEAST_WEIGHT), 1.0 / LEAST_WEIGHT)
             weight_change = weight / unit.weight - 1.0
             change = ti.max(change, ti.abs(weight_change))
             product += weight_change * unit.last_weight_change

@@ -187,6 +187,22 @@ def test_steady_and_transient_air_agree_while_a_unit_is_down(flow: str, coupling
     np.testing.assert_allclose(found[1].rack_inlet_c, found[0].rack_inlet_c, atol=0.05)
 
 
+@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
+def test_a_hall_whose_racks_are_all_off_has_finite_air(thermal: str) -> None:
+    values = [
+        "hvac.crac.units=3", f"simulation.thermal={thermal}", *coupled(0.75, 4.0),
+        "protection.ashrae_class=A1",
+        "events.scheduled=[{kind: crac_down, start_h: 0.5, duration_h: 1}]",
+    ]  # fmt: skip
+    with Simulator(load_config("corrected", values)) as sim:
+        sim.reset(0)
+        results = [sim.step() for _ in range(12)]
+    assert min(r.it_w[0] for r in results) < 0.01 * results[0].it_w[0]
+    for result in results:
+        assert np.isfinite(result.rack_inlet_c).all()
+        assert 0.0 < result.inlet_max_c[0] < 200.0
+
+
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_split_halls_and_batches_have_the_bits_of_one(precision: Any) -> None:
     """A large hall is split among threads; its weights need a call of their own."""

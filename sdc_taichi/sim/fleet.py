@@ -318,9 +318,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         design_flow_m3s=np.array([h.design_flow_m3s for h in halls]),
         unit_capacity_w=np.concatenate([_capacity_w(config) for config in listed]),
         setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
-        plenum_coupling=np.array(
-            [c.hvac.crac.plenum_coupling * (c.hvac.crac.units > 1) for c in listed]
-        ),
+        plenum_coupling=np.array([c.hvac.crac.coupling for c in listed]),
         oversupply_decay=np.array([c.hall.recirculation.oversupply_decay for c in listed]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
