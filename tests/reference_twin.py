@@ -17,6 +17,8 @@ from sdc_taichi import DataCenterConfig
 from sdc_taichi.config import HallConfig
 from sdc_taichi.config.hall_schema import ServerGroup
 from sdc_taichi.exogenous import site_pressure_pa
+from sdc_taichi.hall.rack_servers import rack_servers
+from sdc_taichi.hall.recirculation import Recirculation, calibrate
 from sdc_taichi.types import F64, I64
 
 
@@ -422,13 +424,14 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
         return height, airflow, it_w, mean_in_k + it_w / (air * airflow), full_m3s
 
     scaled_to = hall.recirculation.scaled_to
+    if matrix is None and scaled_to in ("row", "hall"):
+        return _of_reference_hall(twin)
     parts = {"row": hall.rows, "hall": 1}.get(scaled_to, racks)
     if scaled_to != "none":
         approach_k = np.repeat(approach_k.reshape(parts, -1).mean(axis=1), racks // parts)
     exposed = np.ones(racks)
     if matrix is None:
         weights = layout_weights(hall, design(approach_k)[1])
-        exposed = exposure(hall, design(approach_k)[1])
     else:
         weights = matrix.copy()
         for j in range(racks):
@@ -477,25 +480,49 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     )
 
 
-def exposure(hall: HallConfig, airflow: F64) -> F64:
-    """Exposure of every rack to exhaust air, (R,), rack by rack."""
-    m, closed, per_row = hall.layout, hall.layout.containment, hall.racks_per_row
-    if m.returns == "ceiling":
-        around, around_m, over, demand = 4.0, 0.6, 0.4 * (1 - closed), 10.0
-    else:
-        around, around_m, over, demand = 0.6 * (1 - 0.35 * closed), 0.5, 0.6, 4.0
-    x = (np.arange(per_row) + 0.5) * m.rack_pitch_m
-    out = []
-    for row in range(hall.rows):
-        facing = [r for r in (row - row % 2, row - row % 2 + 1) if r < hall.rows]
-        drawn = airflow.reshape(hall.rows, -1)[facing].sum(axis=0)
-        for at in x:
-            near = np.exp(-np.abs(x - at) / 2.2)
-            e = 1.0 + demand * (near @ drawn / near.sum() / drawn.mean() - 1.0)
-            for distance in (at, per_row * m.rack_pitch_m - at):
-                e += around * np.exp(-distance / around_m) - over * np.exp(-distance / 2.3)
-            out.append((e + np.sqrt(e * e + 0.09)) / 2)
-    return np.array(out)
+@functools.lru_cache(maxsize=128)
+def _recirculation(config: DataCenterConfig) -> Recirculation:
+    return calibrate(config)
+
+
+def _of_reference_hall(twin: HallTwin) -> HallTwin:
+    """A hall whose exhaust shares follow from a reference hall; test_exposure.py tests the shares.
+
+    Weights, airflows and sums are those of the twin.
+    """
+    found = _recirculation(twin.config)
+    count = rack_servers(twin.config).count.astype(np.int64)
+    full_m3s = np.repeat(found.design.full_airflow_m3s, count)
+    captured = np.repeat(found.group_exhaust_share, count)
+    twin = replace(twin, full_m3s=full_m3s)
+    load, on = np.ones(len(twin.rack)), np.ones(len(found.exhaust_share))
+    supply_c, air = twin.config.hall.design_supply_c, twin.air_j_per_m3_k
+    weights, rise = found.mix_weights.dense(), found.design.outlet_rise_k
+    for _ in range(60):
+        inlet_c = supply_c + (weights @ rise)[twin.rack] * captured
+        cpu, fan, flow = twin.servers(inlet_c, load, on, on)
+        moved = twin.per_rack(flow)
+        rise = twin.per_rack(flow * (inlet_c - supply_c) + (cpu + fan) / air) / moved
+    need_m3s = twin.per_rack((1.0 - captured) * flow)
+    return replace(
+        twin,
+        need_m3s=need_m3s,
+        captured=captured,
+        weights=weights,
+        share=found.exhaust_share,
+        fresh_share=found.fresh_share,
+        unit_design_m3s=twin.unit_shares.T @ need_m3s / found.fresh_share,
+    )
+
+
+def at_loads(hall: HallTwin, load: F64, powered: F64, breath: F64) -> HallTwin:
+    """The hall with the exhaust shares of racks that work unlike, at a load of every server."""
+    tiles = _recirculation(hall.config).tiles
+    part = hall.full_m3s / hall.per_rack(hall.full_m3s)[hall.rack]
+    airflow_m3s = tiles.airflow_m3s(hall.per_rack(part * load)) * powered * breath
+    share = tiles.exhaust_share(airflow_m3s)
+    ratio = np.divide(share, hall.share, out=np.zeros_like(share), where=hall.share > 0)
+    return replace(hall, captured=hall.captured * ratio[hall.rack], share=share)
 
 
 def shares_of_means(mix_k: F64, exposed: F64, wanted_k: F64, parts: int) -> F64:

@@ -20,6 +20,7 @@ from sdc_taichi.sim.design_hall import (
     design_hall_values,
     solve_design_hall,
 )
+from sdc_taichi.sim.inlet_parts import state_texts
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
 
@@ -163,3 +164,26 @@ def test_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(SdcError, match="cannot be written"):
         show("tiny", "--out", out / "below.png")
     assert [p.name for p in out.parent.iterdir()] == ["plan.png"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ([], "computed; the config gives means of a reference hall of even racks, open hall"),
+        (["hall.recirculation.calibrate=rack"], "imposed rack by rack by the config, in the hall"),
+    ],
+)
+def test_output_says_whether_approaches_are_imposed(settings: list[str], text: str) -> None:
+    found = solve_design_hall(load_config("corrected", settings))
+    assert f"approaches    {text}" in describe_hall(found)
+    assert design_hall_values(found)["approaches"].startswith(text)
+    assert text in " ".join(state_texts(found.inlets.parts(0)))
+
+
+def test_hall_may_be_over_supplied() -> None:
+    ample = ["hall.supply_approach_k=1.5", "hall.return_approach_k=-5"]
+    found = solve_design_hall(load_config("corrected", ample))
+    assert found.air is not None
+    assert found.air.rti_pct == pytest.approx(81, abs=1)
+    assert found.air.bypass_share > 0.2
+    heat_closes(found)

@@ -366,6 +366,7 @@ def _air_lines(design: DesignHall) -> list[str]:
     ]
     if air is None:
         return lines
+    lines.append(f"approaches    {design.config.hall.recirculation.approach_text}")
     low, high = air.spectral_radius_bounds
     known = "at most " if high - low > 1e-6 else ""
     share = air.exhaust_share

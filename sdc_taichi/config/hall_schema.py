@@ -134,6 +134,25 @@ class RecirculationConfig(Section):
     containment then reduces them, or the ``hall`` as it stands, where they were measured. None
     means ``hall`` with ``calibrate: rack``, and ``open_hall`` otherwise."""
 
+    reference_rack_kw: Annotated[float, Field(ge=0.01, le=1000)] | None = None
+    """Power of the servers of a rack in the reference hall of ``calibrate`` ``row`` and ``hall``,
+    at full load and without fans, in kW, 0.01..1,000. Its racks are alike, and the approach
+    temperatures hold in it. Floor and CRAC units of the hall are made for it: racks of more power
+    lack air. None means the mean of the hall, with floor and units made for the racks as they
+    are."""
+
+    @property
+    def approach_text(self) -> str:
+        """Text on whether approach temperatures are imposed or computed, and in which hall."""
+        hall = "open hall" if self.is_of_open_hall else "hall as it stands"
+        if self.scaled_to == "none":
+            return "computed from the matrix file"
+        if self.scaled_to == "rack":
+            return f"imposed rack by rack by the config, in the {hall}"
+        if self.matrix_file is not None:
+            return f"mean of the {self.scaled_to} imposed by the config, racks by the matrix file"
+        return f"computed; the config gives means of a reference hall of even racks, {hall}"
+
     @property
     def is_of_open_hall(self) -> bool:
         """True if the approach temperatures are those without containment."""
@@ -151,6 +170,12 @@ class RecirculationConfig(Section):
             raise ValueError(
                 "calibrate none needs a matrix_file, since the layout alone tells no magnitude; "
                 "valid without one are rack, row and hall"
+            )
+        computed = self.matrix_file is None and self.scaled_to in ("row", "hall")
+        if self.reference_rack_kw is not None and not computed:
+            raise ValueError(
+                f"reference_rack_kw {self.reference_rack_kw:g} needs calibrate row or hall and no "
+                "matrix_file; other approach temperatures are those of the racks as they are"
             )
         if self.matrix_kind is not None and self.matrix_file is None:
             raise ValueError(

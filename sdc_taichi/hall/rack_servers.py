@@ -122,6 +122,56 @@ def rack_servers(config: DataCenterConfig) -> RackServers:
     )
 
 
+def even_servers(
+    servers: RackServers, full_airflow_m3s: F64, rack_kw: float | None = None
+) -> RackServers:
+    """Return the servers of a hall of the same total power and airflow whose racks are all alike.
+
+    Args:
+        servers: Servers of the hall; returned themselves if its racks are alike and ``rack_kw`` is
+            None.
+        full_airflow_m3s: Airflow of one server of each group at an airflow ratio of 1, m3/s, (G,).
+        rack_kw: Power of the servers of a rack at full load, without fans, kW; None keeps the mean
+            of the hall.
+    """
+    racks, groups = len(servers.group_offsets) - 1, np.diff(servers.group_offsets)
+    columns = [
+        getattr(servers, name)
+        for name in ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation")
+    ]
+    columns += [servers.full_airflow_m3s, servers.design_rise_k, servers.fan_reference_w]
+    columns += [servers.height_factor]
+    if rack_kw is None and np.all(groups == groups[0]):
+        by_rack = np.stack(columns).reshape(len(columns), racks, -1)
+        if np.array_equal(by_rack, np.broadcast_to(by_rack[:, :1], by_rack.shape), equal_nan=True):
+            return servers
+    total = servers.count.sum()
+    scale = 1.0
+    if rack_kw is not None:
+        scale = 1e3 * rack_kw * racks / float(np.sum(servers.count * servers.full_w))
+    full_w, idle_w, fan_w, airflow_m3s = (
+        scale * float(np.sum(servers.count * values)) / total
+        for values in (servers.full_w, servers.idle_w, servers.fan_reference_w, full_airflow_m3s)
+    )
+    # The levels of the height factors, one group for each.
+    level, of_group = np.unique(servers.height_factor, return_inverse=True)
+    count = np.bincount(of_group, servers.count) / racks
+    each = racks * len(level)
+    return RackServers(
+        group_offsets=np.arange(racks + 1, dtype=np.int32) * np.int32(len(level)),
+        count=np.tile(count, racks),
+        full_w=np.full(each, full_w),
+        idle_w=np.full(each, idle_w),
+        inlet_offset_k=np.zeros(each),
+        load_deviation=np.zeros(each),
+        full_airflow_m3s=np.full(each, airflow_m3s),
+        design_rise_k=np.full(each, np.nan),
+        fan_reference_w=np.full(each, fan_w),
+        height_factor=np.tile(level, racks),
+        air=servers.air,
+    )
+
+
 def _values(group: ServerGroup, servers: ServerConfig) -> tuple[float | None, ...]:
     """Return the properties of a group in the order that ``_rack_columns`` requires.
 

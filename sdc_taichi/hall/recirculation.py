@@ -7,10 +7,12 @@ in the intake of rack j, and w_ji are weights:
 
 (Tang, Gupta and Varsamopoulos 2008, *Energy-efficient thermal-aware task scheduling for homogeneous
 high-performance computing data centers*, IEEE TPDS 19(11)). The weights w follow from the layout
-(``mix_weights``) or from a matrix file (``matrix_file``). The shares r are such that the configured
-approach temperatures (inlet minus supply) hold exactly at the design point, either for every rack
-or as means of the rows or of the hall. With means, the racks of a row or hall differ by their
-exposure (``exposure``) or by the matrix.
+(``mix_weights``) or from a matrix file (``matrix_file``). The shares r follow from the configured
+approach temperatures (inlet minus supply). Those of every rack hold exactly at the design point.
+Means of the rows or of the hall hold in a reference hall, whose racks are all alike; there the
+racks differ by their places, and in the real hall also by the air that they and their neighbours
+draw (``exposure``). With a matrix file, means hold in the real hall, and racks differ by the
+matrix.
 """
 
 from __future__ import annotations
@@ -22,12 +24,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig, HallConfig
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import EXACT_RACKS, DesignPoint, design_point, design_point_at
+from sdc_taichi.hall.exposure import TileAir, exposure, lack_slope, with_lack
 from sdc_taichi.hall.matrix_file import read_matrix, share_matrix
 from sdc_taichi.hall.mix_weights import MixWeights, dense_weights, layout_weights
-from sdc_taichi.hall.rack_servers import RackServers, rack_servers
+from sdc_taichi.hall.rack_servers import RackServers, even_servers, rack_servers
 from sdc_taichi.types import F64
 
 Result = TypeVar("Result")
@@ -43,17 +46,9 @@ _LARGE_WITHIN_K = 1e-3
 """Tolerance for halls of more than EXACT_RACKS if means of the approach temperatures are
 configured, in K."""
 _CONTAINED_WITHIN_K = 1e-9
-"""Tolerance of the iteration for the exhaust mixes of a hall with containment, in K."""
-
-
-OVER_M = 2.3
-"""Length, in m, of the zone at a row's end where less exhaust air comes over the racks."""
-NEIGHBOURS_M = 2.2
-"""Decay length of the weights by which racks share the supply air of their aisle, in m."""
-LEAST = 0.15
-"""Exposure of a rack for which the sum of the terms is 0; the mean exposure is about 1."""
-_REACH = 40.0
-"""Distance beyond which the weights of neighbours are neglected, in decay lengths."""
+"""Tolerance of the iteration for the exhaust mixes of a hall with given exhaust shares, in K."""
+_MOST_SCALINGS, _SCALED_WITHIN = 50, 1e-10
+"""Maximum number of iterations for supply air that does not suffice, and their tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +68,11 @@ class Recirculation:
     """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
     design: DesignPoint
     """Design point of the hall with containment, but ``height_factor`` without containment."""
+    tiles: TileAir
+    """Exhaust shares at other airflows of the racks than those of the design point."""
+    reference_it_w: float | None
+    """IT power of each rack of the reference hall of the approach temperatures, in W; None if they
+    are imposed on the racks as they are."""
 
     def matrix(self) -> F64:
         """Return the share of rack i's exhaust in the intake of rack j as entry [j, i], (R, R)."""
@@ -85,7 +85,9 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
     The exhaust share of rack j is r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, with the
     approach temperatures a and the temperature rises dT through the racks. If only means of the
     approach temperatures are configured, r_j = k e_j / (1 + k e_j): the ratio of exhaust to supply
-    air is the exposure e_j times a factor k, which is equal for all racks of the row or hall.
+    air is the exposure e_j times a factor k, which is equal for all racks of the row or hall. k is
+    found in the reference hall, whose racks are alike (``even_servers``). In the real hall the
+    exposure is that of its airflows, and racks whose tiles lack air take in more (``TileAir``).
     Containment reduces the exhaust shares if the approach temperatures are those of the open hall.
 
     Args:
@@ -118,45 +120,200 @@ def _calibrated(
     stands include what containment does.
     """
     if config.hall.recirculation.matrix_file is None:
-        weights, open_share, design = _from_layout(config, servers, design)
+        found = _from_layout(config, servers, design)
     else:
-        weights, open_share, design = _from_matrix_file(config, servers, design)
-    open_part = config.hall.remaining_paths
-    share = open_share * open_part
+        found = _from_matrix_file(config, servers, design)
+    hall = config.hall
+    weights, open_share, design = found.weights, found.share, found.design
+    open_part = hall.remaining_paths
+    even_share = (
+        open_part * _share(found.even_odds) if found.is_computed else open_part * open_share
+    )
+    tiles = _tile_air(config, servers, found, _odds(even_share), hall.layout.containment)
+    if open_part < 1.0:
+        tiles = replace(tiles, supply_scale=1.0)
+    share = open_share if open_part == 1.0 else tiles.at_full_load()
     group_share = servers.per_group(share) * design.height_factor
     _check_intakes(config, servers, group_share)
     _check_airflows(config, design, weights, share)
     fresh = _open_fresh_share(config, design, open_share)
     if open_part < 1.0:
         fresh = 1.0 - (1.0 - fresh) * open_part
-        design = _contained_design(config, servers, design, weights, group_share)
+        design = _design_at_shares(config, servers, design, weights, group_share)
     # The exhaust share of an intake is its approach temperature divided by its exhaust mix.
     need_m3s = design.airflow_m3s * (1.0 - design.approach_k / weights.apply(design.outlet_rise_k))
     if open_part < 1.0:
         design = replace(design, crac_flow_m3s=float(need_m3s.sum()) / fresh)
-    return Recirculation(weights, share, group_share, fresh, need_m3s, design)
+    return Recirculation(
+        weights, share, group_share, fresh, need_m3s, design, tiles, found.reference_it_w
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Calibrated:
+    """Recirculation without the effect of containment on approach temperatures of an open hall."""
+
+    weights: MixWeights
+    """Weights of the exhaust mix of each rack."""
+    share: F64
+    """Share of exhaust air in the intake of each rack, (R,)."""
+    design: DesignPoint
+    """Design point with these shares."""
+    even_odds: F64 | None = None
+    """Ratio of exhaust to supply air of racks that draw what their tiles give, (R,); None if the
+    exhaust shares are imposed on the racks as they are."""
+    supply_scale: float = 1.0
+    """Factor of the supply air in all intakes, at most 1, see ``TileAir``."""
+    reference_it_w: float | None = None
+    """IT power of each rack of the reference hall, in W; None if there is none."""
+
+    @property
+    def is_computed(self) -> bool:
+        """True if the exhaust shares are computed from a reference hall."""
+        return self.even_odds is not None
+
+
+def _odds(share: F64) -> F64:
+    """Return the ratio of exhaust to supply air for exhaust shares, of the same shape."""
+    return np.asarray(share / (1.0 - share))
+
+
+def _share(odds: F64) -> F64:
+    """Return the exhaust shares for ratios of exhaust to supply air, of the same shape."""
+    return np.asarray(odds / (1.0 + odds))
+
+
+def _tile_air(
+    config: DataCenterConfig,
+    servers: RackServers,
+    found: _Calibrated,
+    odds: F64,
+    containment: float,
+) -> TileAir:
+    """Return the exhaust shares of a hall at any airflow of its racks.
+
+    Args:
+        config: The data center.
+        servers: Servers of the hall, see ``rack_servers``.
+        found: Recirculation without containment.
+        odds: Ratio of exhaust to supply air of racks that draw what their tiles give, (R,), or at
+            the design point if the exhaust shares are imposed.
+        containment: Share of the air paths that containment closes, 0..1.
+    """
+    hall, ones, design = config.hall, np.ones(config.hall.racks), found.design
+    most_height = np.maximum.reduceat(design.height_factor, servers.group_offsets[:-1])
+    tiles = TileAir(
+        hall=hall,
+        curves=config.servers.curves,
+        density_ratio=servers.air.density_ratio,
+        full_m3s=servers.per_rack(servers.count * design.full_airflow_m3s),
+        inlet_c=design.supply_c + float(hall.rack_approach_k().mean()),
+        odds=odds,
+        balance=ones,
+        slope=lack_slope(hall.layout.returns, containment),
+        supply_scale=found.supply_scale,
+        of_height=servers.per_rack(design.height_factor) / servers.per_rack(servers.height_factor),
+        most_share=1.0 / most_height,
+    )
+    return (
+        tiles if found.is_computed else replace(tiles, balance=tiles.draw(tiles.airflow_m3s(ones)))
+    )
 
 
 def _from_layout(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
-) -> tuple[MixWeights, F64, DesignPoint]:
-    """Return weights, exhaust shares and design point from the layout, without containment."""
+) -> _Calibrated:
+    """Calibrate the recirculation of the layout, without containment."""
     if config.hall.recirculation.scaled_to == "rack":
         weights = layout_weights(config.hall, design.airflow_m3s)
-        return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
-    mean_k, airflow_m3s = _mean_approach_k(config), design.airflow_m3s
-    if np.any(mean_k != config.hall.rack_approach_k()):
-        airflow_m3s = design_point(config, servers, mean_k).airflow_m3s
-    weights = layout_weights(config.hall, airflow_m3s)
-    return weights, *_shares_by_exposure(
-        config, servers, weights, exposure(config.hall, airflow_m3s)
+        return _Calibrated(weights, design.approach_k / weights.apply(design.outlet_rise_k), design)
+    settings, mean_k = config.hall.recirculation, _mean_approach_k(config)
+    nominal = design_point(config, servers, mean_k)
+    even = even_servers(servers, nominal.full_airflow_m3s, settings.reference_rack_kw)
+    reference = nominal if even is servers else design_point(config, even, mean_k)
+    weights = layout_weights(config.hall, reference.airflow_m3s)
+    share, design, k = _shares_by_exposure(config, even, weights, _exposure(config, reference))
+    reference_it_w = float(reference.it_w.mean())
+    if even is servers:
+        return _Calibrated(weights, share, design, _odds(share), reference_it_w=reference_it_w)
+    even_odds = k * _exposure(config, nominal)
+    if settings.reference_rack_kw is not None:
+        # The floor is made for the reference hall, and gives the racks as much air as there.
+        nominal = replace(nominal, crac_flow_m3s=reference.crac_flow_m3s)
+        drawn = nominal.airflow_m3s.sum() / reference.airflow_m3s.sum()
+        even_odds = with_lack(even_odds, (1.0 + even_odds) * (drawn - 1.0))
+    found = _Calibrated(
+        layout_weights(config.hall, nominal.airflow_m3s),
+        _share(even_odds),
+        nominal,
+        even_odds,
+        reference_it_w=reference_it_w,
     )
+    return _computed(config, servers, found)
+
+
+def _exposure(config: DataCenterConfig, design: DesignPoint) -> F64:
+    """Return the exposure of every rack at the airflows of a design point, (R,)."""
+    supply_share = design.crac_flow_m3s / float(design.airflow_m3s.sum())
+    return exposure(config.hall, design.airflow_m3s, supply_share)
+
+
+def _computed(config: DataCenterConfig, servers: RackServers, found: _Calibrated) -> _Calibrated:
+    """Compute exhaust shares and design point of the real racks of a hall.
+
+    Racks that lack air before their tiles take in more exhaust. If all racks together would take in
+    more supply air than the floor gives, all take in the same share less.
+
+    Args:
+        config: The data center.
+        servers: Servers of the hall, see ``rack_servers``.
+        found: Weights, ``even_odds``, and the design point at the mean approach temperatures.
+
+    Raises:
+        ConfigError: The hall finds no steady state.
+    """
+    assert found.even_odds is not None
+    hall, floor_m3s = config.hall, found.design.crac_flow_m3s
+    closed = hall.layout.containment if hall.remaining_paths == 1.0 else 0.0
+    tiles, scale = _tile_air(config, servers, found, found.even_odds, closed), 1.0
+    for _ in range(_MOST_SCALINGS):
+        share = replace(tiles, supply_scale=scale).at_full_load()
+        design = _design_of_shares(config, servers, found, share)
+        need_m3s = float(np.sum((1.0 - share) * design.airflow_m3s))
+        if need_m3s <= floor_m3s * (1.0 + _SCALED_WITHIN):
+            break
+        scale *= floor_m3s / need_m3s
+    design = replace(design, crac_flow_m3s=floor_m3s)
+    return replace(found, share=share, design=design, supply_scale=scale)
+
+
+def _design_of_shares(
+    config: DataCenterConfig, servers: RackServers, found: _Calibrated, share: F64
+) -> DesignPoint:
+    """Return the design point of a hall with given exhaust shares of its racks.
+
+    Args:
+        config: The data center.
+        servers: Servers of the hall, see ``rack_servers``.
+        found: Weights, and a design point with the same airflow of servers at full speed.
+        share: Share of exhaust air in the intake of each rack, (R,).
+    """
+    near = found.design
+
+    def update(approach_k: F64) -> tuple[F64, DesignPoint]:
+        nonlocal near
+        near = design_point(config, servers, approach_k, near, near.full_airflow_m3s)
+        return share * found.weights.apply(near.outlet_rise_k), near
+
+    exact = config.hall.racks <= EXACT_RACKS
+    within_k = _WITHIN_K if exact else _LARGE_WITHIN_K
+    return _settled(config, near.approach_k, update, within_k)
 
 
 def _from_matrix_file(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
-) -> tuple[MixWeights, F64, DesignPoint]:
-    """Return weights, exhaust shares and design point from a matrix file, without containment."""
+) -> _Calibrated:
+    """Calibrate the recirculation of a matrix file."""
     settings = config.hall.recirculation
     path = Path(settings.matrix_file or "")
     kind, values = read_matrix(config, path)
@@ -179,16 +336,24 @@ def _from_matrix_file(
     row_sums = np.where(no_exhaust, 1.0, sums)[:, None]
     weights = dense_weights(np.where(no_exhaust[:, None], 1.0 / len(sums), matrix / row_sums))
     if settings.scaled_to == "rack":
-        return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
+        return _Calibrated(weights, design.approach_k / weights.apply(design.outlet_rise_k), design)
     if settings.scaled_to != "none":
-        return weights, *_shares_by_exposure(config, servers, weights, sums)
+        share, design, _ = _shares_by_exposure(config, servers, weights, sums)
+        return _Calibrated(weights, share, design)
     design = _solve_design_point(config, servers, lambda at: sums * weights.apply(at.outlet_rise_k))
-    return weights, sums, design
+    return _Calibrated(weights, sums, design)
 
 
 def _parts(config: DataCenterConfig) -> int:
-    """Return the number of equal parts of the hall for which means are configured: rows, or 1."""
-    return config.hall.rows if config.hall.recirculation.scaled_to == "row" else 1
+    """Return the number of equal parts of the hall with their own mean: racks, rows, or 1.
+
+    In a layout, one approach temperature for all racks is the mean of the hall, as it says nothing
+    about rows.
+    """
+    hall, settings = config.hall, config.hall.recirculation
+    by_rows = settings.matrix_file is not None or isinstance(hall.supply_approach_k, tuple)
+    rows = hall.rows if by_rows else 1
+    return {"rack": hall.racks, "row": rows}.get(settings.scaled_to, 1)
 
 
 def _mean_approach_k(config: DataCenterConfig) -> F64:
@@ -200,8 +365,8 @@ def _mean_approach_k(config: DataCenterConfig) -> F64:
 
 def _shares_by_exposure(
     config: DataCenterConfig, servers: RackServers, weights: MixWeights, exposed: F64
-) -> tuple[F64, DesignPoint]:
-    """Return exhaust shares that give the configured mean approaches, and the design point.
+) -> tuple[F64, DesignPoint, F64]:
+    """Return exhaust shares for the configured mean approaches, design point, and factors k, (R,).
 
     Args:
         config: The data center.
@@ -215,20 +380,21 @@ def _shares_by_exposure(
     wanted_k = _mean_approach_k(config)
     exact, near = config.hall.racks <= EXACT_RACKS, None
 
-    def update(approach_k: F64) -> tuple[F64, tuple[F64, DesignPoint]]:
+    def update(approach_k: F64) -> tuple[F64, tuple[F64, DesignPoint, F64]]:
         nonlocal near
         design = design_point(config, servers, approach_k, near)
         near = None if exact else design
         mix_k = weights.apply(design.outlet_rise_k)
-        share = _mean_share(config, mix_k, exposed, wanted_k)
-        return share * mix_k, (share, design)
+        k = _exhaust_factor(config, mix_k, exposed, wanted_k)
+        share = _share(k * exposed)
+        return share * mix_k, (share, design, k)
 
     within_k = _WITHIN_K if exact else _LARGE_WITHIN_K
     return _settled(config, wanted_k, update, within_k)
 
 
-def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F64) -> F64:
-    """Return exhaust shares k e / (1 + k e) that give the wanted mean approaches, (R,).
+def _exhaust_factor(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F64) -> F64:
+    """Return factors k whose exhaust shares k e / (1 + k e) give the wanted mean approaches, (R,).
 
     Each part (row or hall) has its own k. The mean is a concave, rising function of k, so Newton's
     method from k = 0 converges from below.
@@ -239,7 +405,7 @@ def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F6
     mean_mix = np.mean(mix * (e > 0), axis=1)
     if np.any(goal > _MOST_MEAN_SHARE * mean_mix):
         part = int(np.argmax(goal - _MOST_MEAN_SHARE * mean_mix))
-        where = f" of row {part}" if hall.recirculation.scaled_to == "row" else ""
+        where = f" of row {part}" if parts > 1 else ""
         raise ConfigError(
             f"{hall.recirculation.matrix_file or config.name}: hall.supply_approach_k{where} is "
             f"{goal[part]:.3g} K on the mean, but the exhaust that its racks take in is "
@@ -255,8 +421,7 @@ def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F6
         k = k + step
         if np.all(np.abs(step) <= 1e-14 * k):
             break
-    odds = k[:, None] * e
-    return np.asarray(odds / (1.0 + odds)).reshape(-1)
+    return np.repeat(k, hall.racks // parts)
 
 
 def _solve_design_point(
@@ -285,21 +450,21 @@ def _solve_design_point(
     return _settled(config, config.hall.rack_approach_k(), update, _WITHIN_K)
 
 
-def _contained_design(
+def _design_at_shares(
     config: DataCenterConfig,
     servers: RackServers,
     design: DesignPoint,
     weights: MixWeights,
     group_share: F64,
 ) -> DesignPoint:
-    """Compute the design point with containment, except for the airflow of the CRAC units.
+    """Compute the design point with given exhaust shares, except for the CRAC airflow.
 
     Args:
         config: The data center.
         servers: Servers of the hall, see ``rack_servers``.
-        design: Design point without containment.
+        design: Design point with the same servers and height factors.
         weights: Weights of the exhaust mix of each rack.
-        group_share: Share of exhaust air in each group's intake, with containment, (G,).
+        group_share: Share of exhaust air in each group's intake, (G,).
 
     Raises:
         ConfigError: The iteration does not converge.
@@ -398,92 +563,3 @@ def _open_fresh_share(config: DataCenterConfig, design: DesignPoint, share: F64)
             "derives it) or raise hvac.crac.supply_m3s_per_w"
         )
     return min(need_m3s / design.crac_flow_m3s, 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Coefficients:
-    """Coefficients of the exposure of racks for one position of the return air openings."""
-
-    around: float
-    """Additional exposure at the end of a row due to air that flows around this end."""
-    around_length_m: float
-    """Decay length of the exposure to air that flows around the end of a row, in m."""
-    around_closed: float
-    """Relative reduction of ``around`` by full containment, in addition to its general effect on
-    all paths."""
-    over: float
-    """Reduction of exposure at the end of a row, where less air flows over the racks."""
-    over_closed: float
-    """Relative reduction of ``over`` by full containment, in addition to its general effect on all
-    paths."""
-    demand: float
-    """Change of the exposure divided by the relative change of the aisle's local air demand."""
-
-
-_BY_RETURNS = {
-    "ceiling": _Coefficients(4.0, 0.6, 0.0, 0.4, 1.0, 10.0),
-    "end_wall": _Coefficients(0.6, 0.5, 0.35, 0.6, 0.0, 4.0),
-}
-
-
-def exposure(hall: HallConfig, airflow_m3s: F64) -> F64:
-    """Return the relative exposure of every rack to exhaust air, above 0, (R,).
-
-    Exhaust air reaches an inlet around the ends of the rows and over the racks. Its amount rises
-    with the airflow that a rack and its neighbours draw in excess of the local floor supply. The
-    exposure of rack j, with distances x to the ends of its row, is
-
-        e_j = 1 + around sum_ends exp(-x / around_length) - over sum_ends exp(-x / OVER_M)
-                + demand (v_j - 1)
-
-    and is bounded to stay above 0. Here v_j is a weighted mean airflow of the racks that face the
-    aisle near rack j, with weights exp(-distance / NEIGHBOURS_M), divided by the mean of the aisle.
-    The coefficients are fitted to the inlet temperatures that ``sdc-taichi hall solve`` computes
-    for 63 halls of 8 to 200 racks; docs/hall.md shows the quality of the fit.
-
-    Args:
-        hall: Configuration of the hall.
-        airflow_m3s: Airflow of each rack at the design point, m3/s, (R,).
-    """
-    values, closed = _BY_RETURNS[hall.layout.returns], hall.layout.containment
-    places: F64 = np.arange(hall.racks_per_row, dtype=np.float64)
-    along = (places + 0.5) * hall.layout.rack_pitch_m
-    around = values.around * (1.0 - values.around_closed * closed)
-    over = values.over * (1.0 - values.over_closed * closed)
-    ends: F64 = around * _from_ends(along, values.around_length_m)
-    ends -= over * _from_ends(along, OVER_M)
-    demand = _demand(hall, airflow_m3s.reshape(hall.rows, hall.racks_per_row))
-    raw = 1.0 + ends + values.demand * (demand - 1.0)
-    # This smooth, monotonic function keeps the exposure above 0 even if ``raw`` is negative.
-    return np.asarray(raw + np.hypot(raw, 2.0 * LEAST)).reshape(-1) / 2.0
-
-
-def _from_ends(along_m: F64, length_m: float) -> F64:
-    """Return the sum of exp(-distance / length) over both ends of a row, for P racks, (P,)."""
-    from_first: F64 = np.exp(-along_m / length_m)
-    return np.asarray(from_first + from_first[::-1], dtype=np.float64)
-
-
-def _demand(hall: HallConfig, airflow_m3s: F64) -> F64:
-    """Return the airflow drawn near each rack divided by the mean of its aisle, (rows, P).
-
-    Args:
-        hall: Configuration of the hall, with the pitch of the P racks in a row.
-        airflow_m3s: Airflow of each rack, m3/s, (rows, P).
-    """
-    rows, per_row = airflow_m3s.shape
-    # Rows 0 and 1 face the same aisle, and so on; if their number is odd, the last faces a wall.
-    drawn = np.add.reduceat(airflow_m3s, np.arange(0, rows, 2), axis=0)
-    drawn = drawn / drawn.mean(axis=1, keepdims=True)
-    pitches = NEIGHBOURS_M / hall.layout.rack_pitch_m
-    reach = min(per_row - 1, int(np.ceil(_REACH * pitches)))
-    weights = np.exp(-np.abs(np.arange(-reach, reach + 1)) / pitches)
-
-    def smoothed(values: F64) -> F64:
-        return np.asarray(np.convolve(values, weights)[reach : reach + per_row])
-
-    whole = smoothed(np.ones(per_row))
-    # Compute equal aisles, which are most aisles of a hall, only once.
-    distinct, aisle = np.unique(drawn, axis=0, return_inverse=True)
-    around = np.stack([smoothed(values) / whole for values in distinct])
-    return np.asarray(np.repeat(around[aisle.reshape(-1)], 2, axis=0)[:rows])

@@ -37,8 +37,9 @@ The value is a list with the ``air_values`` of each data center in its hottest s
 runs of more than ``MOST_AIR_RACKS`` racks."""
 MOST_AIR_RACKS = 20_000
 """Maximum number of racks of a run whose air is stored."""
-_DECIMALS = 6
-"""Decimals of stored air, so that temperatures are exact to a millionth of a kelvin."""
+_DECIMALS = 8
+"""Decimals of stored air, so that inlets that follow from shares and temperatures are exact to a
+millionth of a kelvin."""
 _MOST = 1e9
 """Limit of the absolute value of stored air; larger values are rejected as damaged."""
 _ROWS_PER_GROUP = 1 << 16

@@ -187,6 +187,7 @@ def design_hall_values(solved: DesignHall) -> dict[str, Any]:
             "rti_pct": air.rti_pct,
             "spectral_radius": list(air.spectral_radius_bounds),
             "exhaust_share": air.exhaust_share.tolist(),
+            "approaches": hall.recirculation.approach_text,
         }
     return {
         "name": solved.config.name,

@@ -16,6 +16,7 @@ from sdc_taichi.config.hall_schema import MOST_RACK_J_PER_K, SERVER_J_PER_K_W
 from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point, odd_airflow
+from sdc_taichi.hall.exposure import TileAir
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import DENSE_RACKS, MixWeights
@@ -83,6 +84,9 @@ class HallAir:
     order, and for each rack the units of its data center."""
     rack_need_m3s: F64
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
+    tiles: tuple[TileAir, ...]
+    """Exhaust shares at other airflows of the racks, for each distinct hall; empty for sampled
+    racks, which are loaded alike."""
     unit_share_offsets: I32
     """First entry of each data center in ``unit_shares``, and the number of entries, (B + 1,)."""
     steady_states: tuple[SteadyStates, ...]
@@ -273,6 +277,8 @@ class _Air:
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
     rack_need_m3s: F64
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
+    tiles: TileAir
+    """Exhaust shares at other airflows of the racks."""
     steady_states: SteadyStates
     """Source of the solver's initial guesses."""
 
@@ -423,6 +429,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
             exhaust_share=of_groups / servers.per_rack(servers.height_factor),
             unit_shares=shares,
             rack_need_m3s=recirculation.need_m3s,
+            tiles=recirculation.tiles,
             steady_states=steady_states,
         )
     else:
@@ -524,6 +531,7 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         unit_share_offsets=offsets_from_counts(
             [air.unit_shares.size for air in airs], "unit shares"
         ),
+        tiles=tuple(air.tiles for air in distinct),
         steady_states=tuple(air.steady_states for air in distinct),
         steady_state_of_dc=entry,
     )

@@ -21,6 +21,7 @@ from sdc_taichi.kernels.hall_arguments import (
     DC_CONTROL,
     DC_OUT,
     DONE,
+    GROUP_INPUTS,
     LANES,
     LAYERS_ARGUMENTS,
     LOADS_PER_DC,
@@ -34,7 +35,7 @@ from sdc_taichi.kernels.hall_arguments import (
     RUNNING,
     STEP_ARGUMENTS,
 )
-from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
+from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet, HallAir
 from sdc_taichi.sim.hall_tables import (
     build_hall_tables,
     build_rows_along_racks,
@@ -247,8 +248,11 @@ class Hall:
         fresh_share = fleet.dcs[row_index(DC_COEFFICIENTS, "fresh_share")]
         self._fresh_m3s = fresh_share[fleet.unit_dc] * fleet.unit_design_m3s
         self._overridden_rows: set[str] = set()
-        """Names of the rows (``powered``, ``fan_airflow``) that the last step set to values other
-        than 1."""
+        """Names of the rows (``powered``, ``fan_airflow``, ``exhaust_share``) that the last step
+        set to values other than those of racks that all work alike."""
+        self._even_exhaust_share = self._rack["exhaust_share"].copy()
+        self._group_parts: F64 | None = None
+        """Part of each group in the airflow of its rack, (G,); None before its first use."""
 
         self._step_kernel = NamedKernel(hall.hall_kernel(precision), STEP_ARGUMENTS)
         self._layers_kernel = NamedKernel(layers.layers_kernel(precision), LAYERS_ARGUMENTS)
@@ -566,6 +570,7 @@ class Hall:
             elif name in self._overridden_rows:
                 row[:] = self._is_rack
                 self._overridden_rows.remove(name)
+        self._set_exhaust_shares(conditions)
         self._tables.plenum.supply_from(conditions.unit_running)
         unit = self._unit
         unit["low"][:] = 1.0 if conditions.unit_low is None else conditions.unit_low
@@ -574,6 +579,38 @@ class Hall:
         unit["setpoint_c"][:] = conditions.unit_supply_c
         self._unit_state["supply_c"][:] = conditions.unit_supply_c
         self._unit_state["excess_k"][:] = 0.0
+
+    def _set_exhaust_shares(self, conditions: Conditions) -> None:
+        """Set the exhaust shares of the racks, which depend on where racks draw more air."""
+        air, row = self._fleet.air, self._rack["exhaust_share"]
+        loads = conditions.rack_load, conditions.group_load
+        working = conditions.powered, conditions.rack_airflow
+        if air is not None and any(values is not None for values in (*loads, *working)):
+            self._places.put(row, self._exhaust_shares(air, conditions))
+            self._overridden_rows.add("exhaust_share")
+        elif "exhaust_share" in self._overridden_rows:
+            row[:] = self._even_exhaust_share
+            self._overridden_rows.remove("exhaust_share")
+
+    def _exhaust_shares(self, air: HallAir, conditions: Conditions) -> F64:
+        """Return the share of exhaust air in the intake of each rack, 0..1, (R,)."""
+        fleet, load = self._fleet, conditions.rack_load
+        if conditions.group_load is not None:
+            if self._group_parts is None:
+                self._group_parts = _group_parts(fleet)
+            load = fleet.group_sums(self._group_parts * conditions.group_load)
+        elif load is None:
+            load = conditions.utilisation[fleet.rack_dc]
+        shares = np.empty(fleet.racks)
+        for entry, tiles in enumerate(air.tiles):
+            dcs = np.flatnonzero(air.steady_state_of_dc == entry)
+            racks = fleet.rack_offsets[dcs][:, None] + np.arange(tiles.hall.racks)
+            airflow_m3s = tiles.airflow_m3s(load[racks])
+            for values in (conditions.powered, conditions.rack_airflow):
+                if values is not None:
+                    airflow_m3s *= values[racks]
+            shares[racks] = tiles.exhaust_share(airflow_m3s) * tiles.of_height
+        return shares
 
     def _set_state(self, state: HallState, coil: Coil, chosen: npt.NDArray[np.bool_]) -> None:
         """Write the thermal state at the start of a transient step to the kernels.
@@ -957,6 +994,13 @@ def _water_rows(water: ChilledWater | None) -> dict[str, F64 | float]:
         "tank_most_j": water.tank_most_j,
         "tank_share": water.tank_share,
     }
+
+
+def _group_parts(fleet: Fleet) -> F64:
+    """Return the airflow of each server group divided by that of its rack, (G,)."""
+    count, full = (list(GROUP_INPUTS).index(name) for name in ("count", "full_airflow"))
+    airflow = np.concatenate([rows[count] * rows[full] for rows in fleet.group_rows])
+    return airflow / np.repeat(fleet.group_sums(airflow), np.diff(fleet.group_offsets))
 
 
 def _condition_shapes(fleet: Fleet) -> dict[str, tuple[int]]:

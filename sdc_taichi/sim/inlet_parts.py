@@ -53,6 +53,9 @@ class IntakeAir:
     """Remaining airflow of each rack's fans as a share of full airflow, 0..1, (R,)."""
     powered: F64
     """Share of the step during which each rack is on, 0..1, (R,)."""
+    exhaust_share: F64
+    """Share of exhaust air in the intake of each rack where CRAC units cover its demand, 0..1,
+    (R,)."""
     setpoint_c: F64
     """Supply air setpoint of each CRAC unit, in C, (U,)."""
     supply_c: F64
@@ -98,6 +101,7 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
         "outlet_c": out["outlet_c"],
         "fan_airflow": rack["fan_airflow"],
         "powered": rack["powered"],
+        "exhaust_share": rack["exhaust_share"],
     }
     racks = tables.places.values_of_racks(np.stack([*rows.values()]))
     return IntakeAir(
@@ -174,6 +178,8 @@ class InletParts:
     """Contribution of the server's height in its rack, in K; negative near the floor."""
     shortfall_k: float
     """Contribution of the exhaust air that replaces missing supply air of the CRAC units, in K."""
+    approaches: str
+    """Text on whether approach temperatures are imposed by the config or computed."""
     containment: float
     """Share of the air paths between exhausts and inlets that containment closes, 0..1."""
     contained_k: float | None
@@ -241,15 +247,14 @@ class Inlets:
         self._group_offsets = offsets - offsets[0]
         if fleet.air is None:
             self._shares = np.ones((self._racks, 1))
-            self._exhaust_share = np.zeros(self._racks)
+            self._exhaust_share = air.exhaust_share
         else:
             first, end = fleet.air.unit_share_offsets[dc : dc + 2]
             shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
             self._shares = weighted_shares(shares, air.unit_weight)
-            racks = slice(self._first_rack, self._first_rack + self._racks)
             excess = np.maximum(self._shares @ air.supply_ratio - 1.0, 0.0)
             lowered = np.exp(-fleet.oversupply_decay[dc] * excess)
-            self._exhaust_share = fleet.air.exhaust_share[racks] * lowered
+            self._exhaust_share = air.exhaust_share * lowered
         self._group_inlet_c = self._group_inlets()
 
     def hottest(self, most: int) -> list[int]:
@@ -287,6 +292,7 @@ class Inlets:
             layout_k=0.0,
             height_k=0.0,
             shortfall_k=0.0,
+            approaches=fleet.configs[self._dc].hall.recirculation.approach_text,
             containment=fleet.configs[self._dc].hall.layout.containment,
             contained_k=0.0,
             airflow_m3s=float(air.airflow_m3s[rack]),
@@ -390,6 +396,8 @@ def exhaust_terms(parts: InletParts) -> list[tuple[str, float]]:
 def state_texts(parts: InletParts) -> list[str]:
     """Describe containment, CRAC units and fans of a rack in sentences."""
     texts = []
+    if parts.exhaust_share > 0:
+        texts.append(f"approach temperatures are {parts.approaches}")
     if parts.containment > 0:
         kept_out = (
             "" if parts.contained_k is None else f", which keeps out {parts.contained_k:.2f} K"

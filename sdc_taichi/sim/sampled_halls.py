@@ -92,6 +92,7 @@ def sampled_fleet(fleet: Fleet, dcs: I64, modes: Mapping[int, SteadyModes]) -> F
             exhaust_share=air.exhaust_share[racks],
             unit_shares=np.ones(len(racks)),
             rack_need_m3s=air.rack_need_m3s[racks],
+            tiles=(),
             unit_share_offsets=rack_offsets,
             steady_states=tuple(_table(air, int(e), modes) for e in distinct),
             steady_state_of_dc=entry.astype(np.int32),
