@@ -22,7 +22,7 @@ from sdc_taichi.sim.design_hall import (
 )
 from sdc_taichi.sim.inlet_parts import state_texts
 
-WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
+WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[200, 20]"]
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*racks of more than 60 kW")
 
