@@ -263,9 +263,10 @@ class TileAir:
         Args:
             load: Load of each rack, 0..1, (..., R).
         """
-        inlet_c = np.float64(self.inlet_c)
+        inlet_c = np.array(self.inlet_c)
         ratio = self.curves.airflow_ratio(inlet_c, load)
-        return self.full_m3s * self.curves.moved_ratio(ratio, inlet_c, self.density_ratio)
+        moved = self.curves.moved_ratio(ratio, inlet_c, self.density_ratio)
+        return np.asarray(self.full_m3s * moved)
 
     def draw(self, airflow_m3s: F64) -> F64:
         """Return v_j, the air that racks around j draw divided by that of their tiles, (..., R).

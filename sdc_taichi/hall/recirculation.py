@@ -126,9 +126,8 @@ def _calibrated(
     hall = config.hall
     weights, open_share, design = found.weights, found.share, found.design
     open_part = hall.remaining_paths
-    even_share = (
-        open_part * _share(found.even_odds) if found.is_computed else open_part * open_share
-    )
+    even_share = open_share if found.even_odds is None else _share(found.even_odds)
+    even_share = open_part * even_share
     tiles = _tile_air(config, servers, found, _odds(even_share), hall.layout.containment)
     if open_part < 1.0:
         tiles = replace(tiles, supply_scale=1.0)
