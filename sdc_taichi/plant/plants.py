@@ -32,6 +32,8 @@ _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
 kg/kg; in K."""
 _DAMPER_BAND = 0.1
 """Proportional band of the dampers of outdoor air, as a share of the vapour pressure at a limit."""
+_CLEARLY_LESS = 1.0 - 1e-9
+"""Cost of an operation divided by that of another below which it counts as less."""
 _LEAST_W, _LEAST_K, _LEAST_M3S = 1e-3, 1e-3, 1e-9
 """Lower bounds of divisors that are a power, a temperature difference or an airflow."""
 
@@ -108,7 +110,9 @@ def water_cooled(
     )
     alone, precooled = (loop.at(setpoint_c) for setpoint_c in loop.setpoints_c())
     pairs = zip(alone, precooled, strict=True)
-    chosen = _Operation(*(np.where(precooled.cost_w < alone.cost_w, y, x) for x, y in pairs))
+    # The margin keeps rounding from choosing between equal operations.
+    better = precooled.cost_w < alone.cost_w * _CLEARLY_LESS
+    chosen = _Operation(*(np.where(better, y, x) for x, y in pairs))
     left_w = taken_w - chosen.economiser_w
     removed_w = np.maximum(load_w - chosen.unmet_w, 0.0) if devices.limited else load_w
     return WaterSideResult(
