@@ -653,7 +653,8 @@ def test_reset_is_near_the_best_of_each_hour(site: str) -> None:
 @pytest.mark.parametrize("plant", DRY)
 def test_ledgers_of_dry_plants_close_on_every_step(plant: str, thermal: str) -> None:
     overrides = [*DRY[plant], f"simulation.thermal={thermal}", "events.sampled=[{kind: pump_down, "
-                 "per_year: 200, duration_h: [1, 6], share: 0.1}]"]  # fmt: skip
+                 "per_year: 200, duration_h: [1, 6], share: 0.1}]",
+                 "servers.heat_capacity_kj_per_k=4.155"]  # fmt: skip
     configs = sites_and_seasons(overrides, ("AZ", "IL", "WA"), ("01-10", "04-20", "07-15"))
     run = record(configs, 4 * 96, None, "f64")
     for name in LEDGERS if thermal == "quasi_steady" else TRANSIENT_LEDGERS:
