@@ -172,8 +172,8 @@ class State:
     """Supply airflow that the racks would demand from each CRAC unit if all units ran, in m3/s,
     (U,); only in transient halls."""
     plain_m3s: F64
-    """The same at the exhaust shares of the design point, which oversupply does not lower, in m3/s,
-    (U,); only in transient halls."""
+    """Supply airflow that the racks would demand from each CRAC unit if all units ran and no
+    oversupply lowered exhaust shares, in m3/s, (U,); only in transient halls."""
     following: F64
     """Speed of fans that follow the hottest inlet, otherwise the speed at which each CRAC unit
     would just meet the demand of the racks, as a share of full speed, (U,); only in transient
