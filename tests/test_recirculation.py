@@ -395,7 +395,7 @@ def test_racks_with_failing_fans_give_no_more_heat_than_they_have(
         # Most of what it gives off goes back to the units and not to its neighbours. Its tiles give
         # air that the far end of its aisle lacks.
         others = np.delete(sums.rack_inlet_c - before.rack_inlet_c, failed)
-        assert np.all(np.abs(others) < 1.0)
+        assert np.all(np.abs(others) < 1.2)
 
 
 @settings(phases=AS_FOUND, max_examples=10)
