@@ -298,10 +298,14 @@ def _design_of_shares(
         share: Share of exhaust air in the intake of each rack, (R,).
     """
     near = found.design
+    # Servers with a design rise keep it; all others keep the airflow of the reference hall.
+    by_rise = ~np.isnan(servers.design_rise_k)
+    full_m3s = np.where(by_rise, servers.full_airflow_m3s, near.full_airflow_m3s)
+    servers = replace(servers, full_airflow_m3s=full_m3s)
 
     def update(approach_k: F64) -> tuple[F64, DesignPoint]:
         nonlocal near
-        near = design_point(config, servers, approach_k, near, near.full_airflow_m3s)
+        near = design_point(config, servers, approach_k, near)
         return share * found.weights.apply(near.outlet_rise_k), near
 
     exact = config.hall.racks <= EXACT_RACKS
