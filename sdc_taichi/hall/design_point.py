@@ -82,7 +82,6 @@ def design_point(
     servers: RackServers | None = None,
     approach_k: F64 | None = None,
     near: DesignPoint | None = None,
-    full_airflow_m3s: F64 | None = None,
 ) -> DesignPoint:
     """Compute power, airflow and temperatures of every rack at full load and design supply air.
 
@@ -94,8 +93,6 @@ def design_point(
         approach_k: Inlet minus supply temperature of each rack, K, (R,); None takes the configured
             ones.
         near: A design point near that of the result, from which the iteration starts.
-        full_airflow_m3s: Airflow of one server of each group at an airflow ratio of 1, m3/s, (G,);
-            None takes the configured airflow, or derives it from ``approach_k``.
 
     Raises:
         ConfigError: The approach temperatures leave no positive temperature rise for the servers.
@@ -107,16 +104,9 @@ def design_point(
     height_factor = np.ones(len(servers.count))
     if config.hall.inlet_model == "recirculation":
         start = height_factor if near is None else near.height_factor
-        height_factor = _height_factor(config, servers, approach_k, start, full_airflow_m3s)
+        height_factor = _height_factor(config, servers, approach_k, start)
     inlet_c = _inlet_c(servers, supply_c, group_approach_k, height_factor)
-    return design_point_at(
-        config,
-        servers,
-        inlet_c,
-        height_factor,
-        approach_k=approach_k,
-        full_airflow_m3s=full_airflow_m3s,
-    )
+    return design_point_at(config, servers, inlet_c, height_factor, approach_k=approach_k)
 
 
 def design_point_at(
@@ -193,7 +183,6 @@ def _height_factor(
     servers: RackServers,
     approach_k: F64,
     start: F64,
-    full_airflow_m3s: F64 | None,
 ) -> F64:
     """Return height factors of the groups with an airflow-weighted mean of 1 in each rack, (G,).
 
@@ -205,9 +194,7 @@ def _height_factor(
     within = _EXACT_FACTOR if config.hall.racks <= EXACT_RACKS else _LARGE_FACTOR
     for _ in range(_MOST_HEIGHT_ITERATIONS):
         inlet_c = _inlet_c(servers, supply_c, group_approach_k, factor)
-        full_m3s = full_airflow_m3s
-        if full_m3s is None:
-            full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
+        full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
         airflow = servers.count * full_m3s * _at_full_load(config, servers, inlet_c)[1]
         mean = servers.per_rack(airflow * servers.height_factor) / servers.per_rack(airflow)
         previous, factor = factor, servers.height_factor / servers.per_group(mean)
