@@ -140,6 +140,8 @@ sweep for it."""
 SAMPLE_SWEEPS = 20
 """Largest number of sweeps of sampled racks; without success large halls start from the supply
 temperature."""
+EVEN_WITHIN = 1e-9
+"""Largest difference of load, power or airflow between racks that work alike."""
 MOST_SWEEPS = 2000
 """Maximum number of sweeps. Steady states take 2 to 40 sweeps, and several hundred if the CRAC
 units supply a tenth of the airflow of the servers."""
@@ -601,15 +603,19 @@ class Hall:
             load = fleet.group_sums(self._group_parts * conditions.group_load)
         elif load is None:
             load = conditions.utilisation[fleet.rack_dc]
-        shares = np.empty(fleet.racks)
+        shares = air.exhaust_share.copy()
+        work = [x for x in (load, conditions.powered, conditions.rack_airflow) if x is not None]
         for entry, tiles in enumerate(air.tiles):
             dcs = np.flatnonzero(air.steady_state_of_dc == entry)
             racks = fleet.rack_offsets[dcs][:, None] + np.arange(tiles.hall.racks)
-            airflow_m3s = tiles.airflow_m3s(load[racks])
-            for values in (conditions.powered, conditions.rack_airflow):
-                if values is not None:
+            spread = np.max([np.ptp(values[racks], axis=1) for values in work], axis=0)
+            # Racks that work alike keep the shares of the design point to the bit.
+            racks = racks[spread > EVEN_WITHIN]
+            if racks.size:
+                airflow_m3s = tiles.airflow_m3s(load[racks])
+                for values in work[1:]:
                     airflow_m3s *= values[racks]
-            shares[racks] = tiles.exhaust_share(airflow_m3s) * tiles.of_height
+                shares[racks] = tiles.exhaust_share(airflow_m3s) * tiles.of_height
         return shares
 
     def _set_state(self, state: HallState, coil: Coil, chosen: npt.NDArray[np.bool_]) -> None:
