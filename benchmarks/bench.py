@@ -104,7 +104,7 @@ def kernel_and_peer(quick: bool) -> Iterator[Figure]:
         for size in (QUICK_SIZES if quick else SIZES)
     }
     count, servers = (4, 20) if quick else (1024, 200)
-    unlike = steps.unlike(["hall.inlet_model=approach"], servers)
+    unlike = steps.unlike(["hall.inlet_model=approach", *steps.STRAIGHT_LINES], servers)
     fleets[f"{count} x 20 x {servers}, each server its own"] = sdc_taichi.build_fleet(
         sdc_taichi.make_configs(unlike, count=count)
     )

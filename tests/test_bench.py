@@ -67,7 +67,8 @@ def test_the_peer_computes_what_the_kernel_computes(
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     peer, steps = map(importlib.import_module, ("peer", "steps"))
     if each_its_own:
-        fleet = build_fleet(make_configs(steps.unlike(["hall.inlet_model=approach"], 7), count=3))
+        overrides = ["hall.inlet_model=approach", *steps.STRAIGHT_LINES]
+        fleet = build_fleet(make_configs(steps.unlike(overrides, 7), count=3))
     else:
         fleet = steps.fleet_of(3, 10, 7, "approach")
     conditions = steps.conditions(fleet)

@@ -321,7 +321,7 @@ def test_air_that_finds_no_steady_state_ends_the_run_in_a_step_that_is_named() -
     with Simulator(load_config("corrected", changes)) as sim:
         sim.reset()
         sim.step()
-        cause = r"CRAC units move 0\.\d+ m3/s, the most in this step, and the racks draw 2\d\.\d"
+        cause = r"CRAC units move 0\.\d+ m3/s, the most in this step, and the racks draw \d\.\d"
         message = rf"^corrected: no steady .*{cause}.* \(step 1\)$"
         with pytest.raises(PhysicalLimitError, match=message):
             sim.step()

@@ -71,7 +71,7 @@ def program(*arguments: object, **options: Any) -> subprocess.CompletedProcess[s
 @pytest.fixture(scope="module")
 def two_sites(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("two") / "run"
-    controller = "load=greedy-ci,cooling=warmest,battery=lookahead-24h"
+    controller = "load=greedy-ci,cooling=warmest,battery=greedy-ci"
     simulate(
         out, "--site", "ny,ca", "--days", 2, "--start", "07-01", "--controller", controller,
         "--precision", "f64",

@@ -509,17 +509,20 @@ def test_setpoints_by_unit_or_as_means_of_unequal_halls(
 
 def test_values_beyond_a_range_and_series_that_never_change() -> None:
     n = 200
+    config = load_config(
+        "tiny", ["hvac.sizing.design_outdoor_c=35", "hvac.sizing.design_wet_bulb_c=25"]
+    )
     ci = np.where(np.arange(n) % 2 == 0, 0.0, 2000.0)
     outdoor = np.where(np.arange(n) % 2 == 0, -60.0, 60.0)
     drivers = drivers_from_arrays(outdoor, outdoor - 1.0, ci, np.full(n, 0.5))
     leads: dict[str, Any] = {"ci_leads_h": [0.25], "weather_leads_h": [0.25]}
-    observer, seen = watch([load_config("tiny")], 1, drivers, **leads)
+    observer, seen = watch([config], 1, drivers, **leads)
     first, second = (parts(state, observer.state_features) for _, _, state, _ in seen)
     for name in ("ci", "outdoor", "wet_bulb"):
         assert (first[name].item(), second[name].item()) == (0.0, 1.0)
         assert (first[f"{name}_forecast"].item(), second[f"{name}_forecast"].item()) == (1.0, 0.0)
     constant = drivers_from_arrays(outdoor, outdoor - 1.0, np.full(n, 300.0), np.full(n, 0.5))
-    observer, seen = watch([load_config("tiny")], 1, constant)
+    observer, seen = watch([config], 1, constant)
     entries = parts(seen[0][2], observer.state_features)
     for name in ("ci_rank", "ci_relative", "ci_swing"):
         assert not entries[name].any()

@@ -174,12 +174,15 @@ def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> No
 
 
 def test_rooms_hold_what_has_no_temperature_of_its_own() -> None:
-    for thermal, j_per_k_w in (("quasi_steady", 45.0), ("transient", 15.0)):
+    # Servers hold 30 J/(K W), and at most 410 kJ/K in a rack.
+    servers_kj_per_k = 20 * 410.0
+    for thermal, kj_per_k in (("quasi_steady", servers_kj_per_k), ("transient", 0.0)):
         config = load_config("corrected", [f"simulation.thermal={thermal}"])
         drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
         with Simulator(config, drivers=drivers) as sim:
-            kj_per_k = j_per_k_w * config.rack_nameplate_w().sum() / 1e3
-            assert sim.sizing.room_kwh_per_k * 3600 == pytest.approx(kj_per_k)
+            coils_kj_per_k = 15.0 * config.rack_nameplate_w().sum() / 1e3
+            room_kj_per_k = sim.sizing.room_kwh_per_k * 3600
+            assert room_kj_per_k == pytest.approx(coils_kj_per_k + kj_per_k)
 
 
 # --- copies and sampling ------------------------------------------------------------------------

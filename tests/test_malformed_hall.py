@@ -90,18 +90,20 @@ def test_given_inlets_know_no_air(override: str, what: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "parts"),
+    ("override", "calibrate", "parts"),
     [
         (
             "servers.fan_full_airflow_m3s=0.051",
+            "rack",
             ["servers draw 4", "CRAC units give 3", "servers.fan_full_airflow_m3s"],
         ),
-        ("hall.supply_approach_k=14", ["of rack ", " needs 1.1", "valid is below 1"]),
-        ("hall.supply_approach_k=18", ["fan_full_airflow_m3s null", "leave -0.", "above 0"]),
+        ("hall.supply_approach_k=14", "rack", ["of rack ", " needs 1.0", "valid is below 1"]),
+        ("hall.supply_approach_k=16", "row", ["is 16 K on the mean", "valid is at most 90 %"]),
+        ("hall.supply_approach_k=18", "row", ["fan_full_airflow_m3s null", "leave -0.", "above 0"]),
     ],
 )
-def test_hall_that_cannot_close_is_refused(override: str, parts: list[str]) -> None:
-    config = load_config("corrected", [override])
+def test_hall_that_cannot_close_is_refused(override: str, calibrate: str, parts: list[str]) -> None:
+    config = load_config("corrected", [override, f"hall.recirculation.calibrate={calibrate}"])
     with pytest.raises(ConfigError) as caught:
         build_fleet(config)
     for part in parts:

@@ -154,9 +154,9 @@ def test_series_are_the_columns_of_the_run(run: Run, dc: int) -> None:
         assert found["SeriesLines:names"] == [[f"{n} [{plot.unit}]" for n, *_ in plot.lines]]
         for (name, field, _), values in zip(plot.lines, scalars(found).T, strict=True):
             if field == "pue":
-                it_w, hvac_w = run.column("it_w", dc), run.column("hvac_w", dc)
+                it_w, overhead_w = run.column("it_w", dc), run.column("overhead_w", dc)
                 some = it_w > 0
-                expected = np.where(some, 1.0 + hvac_w / np.where(some, it_w, 1.0), np.nan)
+                expected = np.where(some, 1.0 + overhead_w / np.where(some, it_w, 1.0), np.nan)
             else:
                 factor = {"W": 1e-3, "kWh": 4.0, "g CO2e": 1e-3}.get(QUANTITIES[field].unit, 1.0)
                 expected = run.column(field, dc) * factor
@@ -190,7 +190,7 @@ def test_units_rewards_and_fleet_are_recorded(run: Run) -> None:
     np.testing.assert_array_equal(scalars(terms)[:, 1], -run.column("water_l", 2))
     by_step = run.steps.groupby("step")
     expected = {
-        "pue": 1.0 + by_step["hvac_w"].sum() / by_step["it_w"].sum(),
+        "pue": 1.0 + by_step["overhead_w"].sum() / by_step["it_w"].sum(),
         "hottest_inlet_c": by_step["inlet_max_c"].max(),
         "it_kw": by_step["it_w"].sum() / 1e3,
         "carbon_kg": by_step["carbon_g"].sum() / 1e3,
