@@ -79,6 +79,6 @@ def test_agents_trained_for_a_moment_beat_idle_ones(rewards: str) -> None:
         total += idle["demand_charge"]
     gain = sum(found[name] - idle[name] for name in parts)
     assert gain > 0.005 * -total, (gain, idle, found)
-    # Work is in time, and inlets are at most 0.1 K above 27 C in the mean.
+    # Work is in time, and inlets are at most 0.3 K above 27 C in the mean.
     assert found["sla"] > -1.0
-    assert found["hot_inlets"] > idle["hot_inlets"] - 0.1 * 16 * 192
+    assert found["hot_inlets"] > idle["hot_inlets"] - 0.3 * 16 * 192
