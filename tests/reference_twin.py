@@ -519,7 +519,10 @@ def at_loads(hall: HallTwin, load: F64, powered: F64, breath: F64) -> HallTwin:
     """The hall with the exhaust shares of racks that work unlike, at a load of every server."""
     tiles = _recirculation(hall.config).tiles
     part = hall.full_m3s / hall.per_rack(hall.full_m3s)[hall.rack]
-    airflow_m3s = tiles.airflow_m3s(hall.per_rack(part * load)) * powered * breath
+    rack_load = hall.per_rack(part * load)
+    if max(np.ptp(rack_load), np.ptp(powered), np.ptp(breath)) < 1e-9:
+        return hall
+    airflow_m3s = tiles.airflow_m3s(rack_load) * powered * breath
     share = tiles.exhaust_share(airflow_m3s)
     ratio = np.divide(share, hall.share, out=np.zeros_like(share), where=hall.share > 0)
     return replace(hall, captured=hall.captured * ratio[hall.rack], share=share)
