@@ -61,7 +61,7 @@ def test_simulation_at_the_design_point_is_what_hall_show_prints(
         assert shown.air.rti_pct == pytest.approx(100.0)
     expected_c = {0.0: 28.15, 0.7: 24.34, 0.9: 23.44, 1.0: 23.0}
     if containment in expected_c:
-        # Of the reference hall; racks of unlike power differ a little.
+        # The mean holds in the reference hall, whose racks have equal power.
         assert shown.inlet_c.mean() == pytest.approx(expected_c[containment], abs=0.15)
 
 

@@ -142,7 +142,8 @@ SOLVED_PLACES_K = {
     "end_wall": [6.9, 7.3, 8.4, 7.0, 7.6, 7.4, 8.6, 7.3, 8.3, 8.0,
                  7.2, 6.3, 6.0, 6.2, 5.8, 7.6, 5.9, 8.2, 7.1, 6.3],
 }  # fmt: skip
-"""The same for 8 rows of 10 racks, of which 8 at the random places of seeds 0 to 19 have 40 kW."""
+"""Hottest inlet above supply air, in K, of 8 rows of 10 racks, of which 8 racks have 40 kW. Each
+figure is that of other random places of these racks, with the seeds 0 to 19."""
 
 
 def hottest_k(config: DataCenterConfig) -> float:

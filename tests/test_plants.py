@@ -330,7 +330,7 @@ SWEPT = [
 which keep the jumps of their sources."""
 STEP_K, STEP_LOAD, LARGEST_JUMP = 0.002, 2e-4, 0.005
 LARGEST_JUMP_OF_DAMPERS = 0.015
-"""Where dampers close for humid air: without their band, power would jump to several times."""
+"""Largest relative change of power in a step while dampers close because the air is humid."""
 
 
 class Swept(NamedTuple):
@@ -398,7 +398,7 @@ def hvac_w(names: tuple[str, str, str], at: Swept, *, free: bool = True) -> F64:
 
 
 def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
-    """Whether outdoor air is partly admitted because of its moisture."""
+    """Return True where dampers admit only a part of the outdoor air because of its moisture."""
     design = sized(*names).water_side
     _, setpoint_c, outdoor_c, depression_k = np.broadcast_arrays(*at)
     vapour_pa = plants._vapour_pa(outdoor_c, outdoor_c - depression_k, design.pressure_pa)

@@ -133,7 +133,7 @@ def test_more_air_than_racks_need_cools_inlets_only_with_oversupply() -> None:
 
     assert hottest(0.9, 0.0) == pytest.approx(hottest(0.75, 0.0), abs=1e-6)
     assert hottest(0.9, 3.0) < hottest(0.75, 3.0) - 0.3 < hottest(0.75, 0.0) - 0.6
-    # Where units deliver less than racks need, nothing changes.
+    # Oversupply has no effect if the units deliver less air than the racks need.
     assert hottest(0.35, 3.0) == pytest.approx(hottest(0.35, 0.0), abs=1e-6)
 
 

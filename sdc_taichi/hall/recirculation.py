@@ -120,15 +120,15 @@ def _calibrated(
     stands include what containment does.
     """
     if config.hall.recirculation.matrix_file is None:
-        found = _from_layout(config, servers, design)
+        calibrated = _from_layout(config, servers, design)
     else:
-        found = _from_matrix_file(config, servers, design)
+        calibrated = _from_matrix_file(config, servers, design)
     hall = config.hall
-    weights, open_share, design = found.weights, found.share, found.design
+    weights, open_share, design = calibrated.weights, calibrated.share, calibrated.design
     open_part = hall.remaining_paths
-    even_share = open_share if found.even_odds is None else _share(found.even_odds)
+    even_share = open_share if calibrated.even_odds is None else _share(calibrated.even_odds)
     even_share = open_part * even_share
-    tiles = _tile_air(config, servers, found, _odds(even_share), hall.layout.containment)
+    tiles = _tile_air(config, servers, calibrated, _odds(even_share), hall.layout.containment)
     if open_part < 1.0:
         tiles = replace(tiles, supply_scale=1.0)
     share = open_share if open_part == 1.0 else tiles.at_full_load()
@@ -144,7 +144,7 @@ def _calibrated(
     if open_part < 1.0:
         design = replace(design, crac_flow_m3s=float(need_m3s.sum()) / fresh)
     return Recirculation(
-        weights, share, group_share, fresh, need_m3s, design, tiles, found.reference_it_w
+        weights, share, group_share, fresh, need_m3s, design, tiles, calibrated.reference_it_w
     )
 
 
@@ -185,7 +185,7 @@ def _share(odds: F64) -> F64:
 def _tile_air(
     config: DataCenterConfig,
     servers: RackServers,
-    found: _Calibrated,
+    calibrated: _Calibrated,
     odds: F64,
     containment: float,
 ) -> TileAir:
@@ -194,12 +194,12 @@ def _tile_air(
     Args:
         config: The data center.
         servers: Servers of the hall, see ``rack_servers``.
-        found: Recirculation without containment.
+        calibrated: Recirculation without containment.
         odds: Ratio of exhaust to supply air of racks that draw what their tiles give, (R,), or at
             the design point if the exhaust shares are imposed.
         containment: Share of the air paths that containment closes, 0..1.
     """
-    hall, ones, design = config.hall, np.ones(config.hall.racks), found.design
+    hall, ones, design = config.hall, np.ones(config.hall.racks), calibrated.design
     most_height = np.maximum.reduceat(design.height_factor, servers.group_offsets[:-1])
     tiles = TileAir(
         hall=hall,
@@ -210,12 +210,14 @@ def _tile_air(
         odds=odds,
         balance=ones,
         slope=lack_slope(hall.layout.returns, containment),
-        supply_scale=found.supply_scale,
+        supply_scale=calibrated.supply_scale,
         of_height=servers.per_rack(design.height_factor) / servers.per_rack(servers.height_factor),
         most_share=1.0 / most_height,
     )
     return (
-        tiles if found.is_computed else replace(tiles, balance=tiles.draw(tiles.airflow_m3s(ones)))
+        tiles
+        if calibrated.is_computed
+        else replace(tiles, balance=tiles.draw(tiles.airflow_m3s(ones)))
     )
 
 
@@ -241,14 +243,14 @@ def _from_layout(
         nominal = replace(nominal, crac_flow_m3s=reference.crac_flow_m3s)
         drawn = nominal.airflow_m3s.sum() / reference.airflow_m3s.sum()
         even_odds = with_lack(even_odds, (1.0 + even_odds) * (drawn - 1.0))
-    found = _Calibrated(
+    calibrated = _Calibrated(
         layout_weights(config.hall, nominal.airflow_m3s),
         _share(even_odds),
         nominal,
         even_odds,
         reference_it_w=reference_it_w,
     )
-    return _computed(config, servers, found)
+    return _computed(config, servers, calibrated)
 
 
 def _exposure(config: DataCenterConfig, design: DesignPoint) -> F64:
@@ -257,7 +259,9 @@ def _exposure(config: DataCenterConfig, design: DesignPoint) -> F64:
     return exposure(config.hall, design.airflow_m3s, supply_share)
 
 
-def _computed(config: DataCenterConfig, servers: RackServers, found: _Calibrated) -> _Calibrated:
+def _computed(
+    config: DataCenterConfig, servers: RackServers, calibrated: _Calibrated
+) -> _Calibrated:
     """Compute exhaust shares and design point of the real racks of a hall.
 
     Racks that lack air before their tiles take in more exhaust. If all racks together would take in
@@ -266,38 +270,38 @@ def _computed(config: DataCenterConfig, servers: RackServers, found: _Calibrated
     Args:
         config: The data center.
         servers: Servers of the hall, see ``rack_servers``.
-        found: Weights, ``even_odds``, and the design point at the mean approach temperatures.
+        calibrated: Weights, ``even_odds``, and the design point at the mean approach temperatures.
 
     Raises:
         ConfigError: The hall finds no steady state.
     """
-    assert found.even_odds is not None
-    hall, floor_m3s = config.hall, found.design.crac_flow_m3s
+    assert calibrated.even_odds is not None
+    hall, floor_m3s = config.hall, calibrated.design.crac_flow_m3s
     closed = hall.layout.containment if hall.remaining_paths == 1.0 else 0.0
-    tiles, scale = _tile_air(config, servers, found, found.even_odds, closed), 1.0
+    tiles, scale = _tile_air(config, servers, calibrated, calibrated.even_odds, closed), 1.0
     for _ in range(_MOST_SCALINGS):
         share = replace(tiles, supply_scale=scale).at_full_load()
-        design = _design_of_shares(config, servers, found, share)
+        design = _design_of_shares(config, servers, calibrated, share)
         need_m3s = float(np.sum((1.0 - share) * design.airflow_m3s))
         if need_m3s <= floor_m3s * (1.0 + _SCALED_WITHIN):
             break
         scale *= floor_m3s / need_m3s
     design = replace(design, crac_flow_m3s=floor_m3s)
-    return replace(found, share=share, design=design, supply_scale=scale)
+    return replace(calibrated, share=share, design=design, supply_scale=scale)
 
 
 def _design_of_shares(
-    config: DataCenterConfig, servers: RackServers, found: _Calibrated, share: F64
+    config: DataCenterConfig, servers: RackServers, calibrated: _Calibrated, share: F64
 ) -> DesignPoint:
     """Return the design point of a hall with given exhaust shares of its racks.
 
     Args:
         config: The data center.
         servers: Servers of the hall, see ``rack_servers``.
-        found: Weights, and a design point with the same airflow of servers at full speed.
+        calibrated: Weights, and a design point with the same airflow of servers at full speed.
         share: Share of exhaust air in the intake of each rack, (R,).
     """
-    near = found.design
+    near = calibrated.design
     # Servers with a design rise keep it; all others keep the airflow of the reference hall.
     by_rise = ~np.isnan(servers.design_rise_k)
     full_m3s = np.where(by_rise, servers.full_airflow_m3s, near.full_airflow_m3s)
@@ -306,7 +310,7 @@ def _design_of_shares(
     def update(approach_k: F64) -> tuple[F64, DesignPoint]:
         nonlocal near
         near = design_point(config, servers, approach_k, near)
-        return share * found.weights.apply(near.outlet_rise_k), near
+        return share * calibrated.weights.apply(near.outlet_rise_k), near
 
     exact = config.hall.racks <= EXACT_RACKS
     within_k = _WITHIN_K if exact else _LARGE_WITHIN_K

@@ -95,10 +95,11 @@ class CracUnits:
         n_units = len(self._initial_c)
         setpoint_c = self._initial_c.copy()
         low, high = self._free_range
-        coldest_c = self._units.lowest(self.coldest_supply_c(setpoint_c))
+        coldest_supply_c = self.coldest_supply_c(setpoint_c)
+        coldest_c = self._units.lowest(coldest_supply_c)
         return Supply(
             unit_setpoint_c=setpoint_c,
-            coldest_supply_c=self.coldest_supply_c(setpoint_c),
+            coldest_supply_c=coldest_supply_c,
             setpoint_c=self._units.mean(setpoint_c),
             cooling_run=np.zeros(n_units, dtype=np.int64),
             cooling_last=np.full(n_units, np.nan),

@@ -1004,7 +1004,7 @@ def _water_rows(water: ChilledWater | None) -> dict[str, F64 | float]:
 
 def _group_parts(fleet: Fleet) -> F64:
     """Return the airflow of each server group divided by that of its rack, (G,)."""
-    count, full = (list(GROUP_INPUTS).index(name) for name in ("count", "full_airflow"))
+    count, full = (row_index(GROUP_INPUTS, name) for name in ("count", "full_airflow"))
     airflow = np.concatenate([rows[count] * rows[full] for rows in fleet.group_rows])
     return airflow / np.repeat(fleet.group_sums(airflow), np.diff(fleet.group_offsets))
 
