@@ -17,8 +17,9 @@ from sdc_taichi.cli.options import (
     out_option,
     read_config,
 )
-from sdc_taichi.config import DataCenterConfig, HallConfig
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError, printable
+from sdc_taichi.hall.rack_selection import parse_rack
 from sdc_taichi.sim.inlet_parts import (
     InletParts,
     Inlets,
@@ -73,7 +74,7 @@ def why_command(
         name, config, at, inlets = _at_design_point(source, overrides, dc, step)
     else:
         name, config, at, inlets = _in_run(run_folder, overrides, dc, step)
-    index = inlets.hottest(1)[0] if rack is None else rack_number(rack, config.hall)
+    index = inlets.hottest(1)[0] if rack is None else parse_rack(rack, config.hall)
     parts = inlets.parts(index)
     if out is not None:
         _draw(out, config, parts)
@@ -158,26 +159,6 @@ def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:
         digits=2,
     )
     save_picture(floor_plan_figure(config, shown), out, parents=True)
-
-
-def rack_number(text: str, hall: HallConfig) -> int:
-    """Return the index of a rack from a text with its number or with ROW:PLACE.
-
-    Raises:
-        ConfigError: the hall has no such rack.
-    """
-    row, colon, place = text.strip().partition(":")
-    try:
-        numbers = [int(part) for part in ((row, place) if colon else (row,))]
-    except ValueError:
-        numbers = [-1]
-    tops = (hall.rows, hall.racks_per_row) if colon else (hall.racks,)
-    if len(numbers) == len(tops) and all(0 <= n < m for n, m in zip(numbers, tops, strict=True)):
-        return numbers[0] * hall.racks_per_row + numbers[1] if colon else numbers[0]
-    raise ConfigError(
-        f"--rack {text!r}: valid is a rack 0..{hall.racks - 1}, or ROW:PLACE up to "
-        f"{hall.rows - 1}:{hall.racks_per_row - 1}"
-    )
 
 
 def describe_inlet(parts: InletParts, racks_per_row: int) -> str:
