@@ -41,17 +41,27 @@ def scalars(entity: dict[str, list[Any]]) -> npt.NDArray[np.float64]:
     return np.array(entity["Scalars:scalars"], dtype=np.float64)
 
 
-def images(entity: dict[str, list[Any]]) -> npt.NDArray[np.float16]:
-    """Images of an entity, (T, height, width)."""
-    (((form,),)) = entity["DepthImage:format"]
+def classes(entity: dict[str, list[Any]]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint32]]:
+    """Value and colour of every class of a map or a colour bar; class 0 has no value."""
+    ((context,),) = (entity["AnnotationContext:context"],)
+    infos = [entry["class_description"]["info"] for entry in context[0]]
+    assert [info["id"] for info in infos] == list(range(len(infos)))
+    values = [float(info["label"].split()[0]) for info in infos[1:]]
+    return np.array([np.nan, *values]), np.array([info["color"] for info in infos], np.uint32)
+
+
+def images(entity: dict[str, list[Any]]) -> npt.NDArray[np.float64]:
+    """Values of a map's pixels, as the labels of their classes say them, (T, height, width)."""
+    (((form,),)) = entity["SegmentationImage:format"]
     shape = form["height"], form["width"]
-    raw = [bytes(buffer) for (buffer,) in entity["DepthImage:buffer"]]
-    return np.array([np.frombuffer(shot, np.float16).reshape(shape) for shot in raw])
+    raw = [bytes(buffer) for (buffer,) in entity["SegmentationImage:buffer"]]
+    values, _ = classes(entity)
+    return values.take(np.array([np.frombuffer(x, np.uint8).reshape(shape) for x in raw]))
 
 
-def voxels(entity: dict[str, list[Any]]) -> npt.NDArray[np.float32]:
-    """Voxel values of an entity, (T, voxels)."""
-    return np.array(entity["VoxelGridMap:values"], dtype=np.float32)
+def voxels(entity: dict[str, list[Any]]) -> npt.NDArray[np.uint32]:
+    """Colours of an entity's voxels, (T, voxels)."""
+    return np.array(entity["VoxelGridMap:colors"], dtype=np.uint32)
 
 
 def texts(entity: dict[str, list[Any]]) -> list[str]:

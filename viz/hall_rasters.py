@@ -2,80 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F32, I64, Reals
+from sdc_taichi.types import I64
 
-TEMPERATURE_RESOLUTION_K = 1 / 16
-"""Step to which recorded temperatures are rounded, in K.
+from .colour_scales import Classes, ColourScale, classes_of
 
-Half precision represents multiples of this step exactly below 64 C, and they compress well.
-"""
-TEMPERATURE_RANGES_C = {"inlet": (10.0, 45.0), "outlet": (10.0, 60.0)}
-"""Range of the colour map of each temperature, in C; fixed, so that recordings are comparable."""
-COLOURMAPS: dict[str, Literal["inferno", "viridis"]] = {
-    "inlet": "inferno",
-    "outlet": "inferno",
-    "power": "viridis",
-}
-"""Colour map of each quantity, perceptually uniform and legible with colour vision deficiency."""
 MAX_RACKS_WITH_GAPS = 5_000
 """Largest number of racks at which the tiles of a heat map have gaps between them."""
+MAX_NAMED_RACKS = 20_000
+"""Largest number of racks of a hall whose maps name every rack; larger ones name the rows."""
 MAX_RACKS_OF_SMALL_HALL = 200
 """Largest number of racks at which a hall has tiles of full size and all levels in 3D."""
-
-
-class ColourScale(NamedTuple):
-    """Range, resolution and unit of the values that a heat map shows."""
-
-    low: float
-    """Value at the lower end of the colour map, in ``unit``."""
-    high: float
-    """Value at the upper end of the colour map, in ``unit``."""
-    resolution: float
-    """Step to which values are rounded, in ``unit``."""
-    unit: str
-    """Unit of the values: C or kW."""
-
-
-def temperature_scale(quantity: str) -> ColourScale:
-    """Return the colour scale of a rack temperature, in C.
-
-    Args:
-        quantity: ``inlet`` or ``outlet``.
-    """
-    return ColourScale(*TEMPERATURE_RANGES_C[quantity], TEMPERATURE_RESOLUTION_K, "C")
-
-
-def power_scale(fleet: Fleet) -> ColourScale:
-    """Return the colour scale of rack power, in kW.
-
-    The range begins at 0. Its upper end is 1.1 times the largest nameplate power of a rack (a
-    tenth for fans), rounded up to 1, 2 or 5 times a power of ten. The resolution is a power of two
-    whose multiples half precision represents exactly over this range.
-    """
-    nameplate_w = np.concatenate([count * full_w for count, full_w, *_ in fleet.group_rows])
-    largest_kw = float(fleet.group_sums(nameplate_w).max()) * 1.1 / 1e3
-    decade = 10.0 ** np.floor(np.log10(largest_kw))
-    high = float(decade * next(n for n in (1, 2, 5, 10) if n * decade >= largest_kw * (1 - 1e-9)))
-    return ColourScale(0.0, high, float(2.0 ** np.ceil(np.log2(high / 2048))), "kW")
-
-
-def quantised(values: Reals, scale: ColourScale) -> F32:
-    """Round values to the resolution of a scale, and clip them to its range.
-
-    Values are clipped because the Rerun web viewer draws values below the range in the hottest
-    colour.
-    """
-    steps = np.rint(values.astype(np.float32) * np.float32(1.0 / scale.resolution))
-    rounded = np.clip(steps * np.float32(scale.resolution), scale.low, scale.high)
-    return np.asarray(rounded, dtype=np.float32)
 
 
 class TileGrid(NamedTuple):
@@ -121,23 +64,22 @@ def tile_grid(hall: HallConfig) -> TileGrid:
     )
 
 
-def heat_maps(rack_values: Reals, grid: TileGrid, scale: ColourScale) -> npt.NDArray[np.float16]:
-    """Return heat maps of rack values, one per frame; gaps have the lower end of the range.
+def heat_maps(rack_classes: Classes, grid: TileGrid) -> Classes:
+    """Return maps of the classes of racks, one per frame; gaps have class 0.
 
     Args:
-        rack_values: value of each of T frames and R racks, (T, R).
+        rack_classes: class of each rack in each of T frames, (T, R).
         grid: geometry of the tiles.
-        scale: range and resolution of the values.
 
     Returns:
-        Values of the pixels, (T, height, width).
+        Classes of the pixels, (T, height, width).
     """
     rows, per_row, height, width, gap = grid
-    frames, racks = rack_values.shape
-    # Gaps are looked up like racks: index ``racks`` is the value of gaps, and index ``rows`` is
+    frames, racks = rack_classes.shape
+    # Gaps are looked up like racks: index ``racks`` is the class of gaps, and index ``rows`` is
     # an image line that consists of gaps.
-    values = np.full((frames, racks + 1), scale.low, dtype=np.float16)
-    values[:, :racks] = quantised(rack_values, scale)
+    values = np.zeros((frames, racks + 1), dtype=rack_classes.dtype)
+    values[:, :racks] = rack_classes
     rack_of_pixel = np.full((rows + 1, per_row, width + gap), racks)
     rack_of_pixel[:rows, :, :width] = np.arange(racks).reshape(rows, per_row, 1)
     row_of_line = np.full((rows, height + gap), rows)
@@ -147,24 +89,41 @@ def heat_maps(rack_values: Reals, grid: TileGrid, scale: ColourScale) -> npt.NDA
     return lines.take(row_of_line.reshape(-1)[:image_height], axis=1)
 
 
-def colour_bar(scale: ColourScale) -> tuple[F32, list[float]]:
+def rack_numbers(grid: TileGrid) -> npt.NDArray[np.uint16]:
+    """Return the number of the rack of each pixel plus 1, (height, width).
+
+    Gaps belong to the rack before them. Halls of more racks than 16 bits can number have the number
+    of the row instead.
+    """
+    rows, per_row, height, width, gap = grid
+    numbers = np.arange(rows * per_row).reshape(rows, per_row)
+    if rows * per_row > MAX_NAMED_RACKS:
+        numbers = numbers // per_row
+    pixels = numbers.repeat(height + gap, axis=0).repeat(width + gap, axis=1)
+    image_height, image_width = grid.image_shape
+    return (pixels[:image_height, :image_width] + 1).astype(np.uint16)
+
+
+def colour_bar(scale: ColourScale) -> tuple[Classes, list[float]]:
     """Return the image of a colour bar, and the values of its tick marks.
 
     Args:
-        scale: range of the colour bar.
+        scale: the colour scale.
 
     Returns:
-        A horizontal gradient over the range, (height, width), and at most nine round values within
-        the range.
+        Classes of a horizontal gradient over the range, (height, width), and at most nine round
+        values within the range.
     """
     width, height = 240, 10
-    gradient = np.tile(np.linspace(scale.low, scale.high, width, dtype=np.float32), (height, 1))
+    values = np.linspace(scale.low, scale.high, width, dtype=np.float32)
+    gradient = np.tile(classes_of(values, scale), (height, 1))
     span = scale.high - scale.low
     interval = next(
         n for k in (1e-3, 1e-2, 0.1, 1, 10, 100, 1e3) for n in (k, 2 * k, 5 * k) if span / n <= 8
     )
-    count = int(np.floor(span / interval + 1e-9))
-    return gradient, [scale.low + i * interval for i in range(count + 1)]
+    begin = int(np.ceil(scale.low / interval - 1e-9))
+    end = int(np.floor(scale.high / interval + 1e-9))
+    return gradient, [i * interval for i in range(begin, end + 1)]
 
 
 class RackVoxels(NamedTuple):

@@ -13,6 +13,7 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.types import F64, StepResult
 
+from .colour_scales import InletRange, check_inlet_range
 from .recording_output import (
     RecordingOutput,
     check_address,
@@ -53,6 +54,9 @@ class Recorder:
         every: interval of heat maps and of frames of the 3D hall, in steps; None derives it from
             the number of racks in focus. Series always contain every step.
         serve_port: port of 127.0.0.1 to which viewers can connect; 0 picks a free port.
+        inlet_range: lowest and highest inlet of the colours of the maps, in C; ``"same"`` is 10 to
+            45 C, for recordings that are compared; None is the range that the halls use at the
+            beginning of the run, up to their allowable limit at least.
 
     Raises:
         SdcError: rerun-sdk is missing, or an argument is not valid.
@@ -65,6 +69,7 @@ class Recorder:
         focus: Sequence[str] | None = None,
         every: int | None = None,
         serve_port: int | None = None,
+        inlet_range: InletRange = None,
     ) -> None:
         import_rerun()
         self._file: Path | None = None
@@ -84,6 +89,7 @@ class Recorder:
         if every is not None and not (is_whole and every > 0):
             raise SdcError(f"every {every!r}: valid is a positive integer")
         self._every = every
+        self._inlet_range = check_inlet_range(inlet_range)
         self._episodes = 0
         self._writer: RecordingWriter | None = None
 
@@ -146,7 +152,9 @@ class Recorder:
             name=self.file.stem if self.file is not None else "sdc-taichi",
             keep_bytes=keep_bytes,
         )
-        return RecordingWriter(sim, names, focus, description, output, self._every)
+        return RecordingWriter(
+            sim, names, focus, description, output, self._every, self._inlet_range
+        )
 
     def add(self, result: StepResult, *, rewards: Mapping[str, F64] | None = None) -> None:
         """Record the latest step of the simulator; call this before the next step.

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 
 MAX_BLOCK_STEPS, MAX_BLOCK_BYTES = 1_024, 16_000_000
 """Number of steps and of bytes at which the block in memory is written to the recording."""
+MAP_QUANTITIES = ("inlet", "outlet", "power", "rise")
+"""Quantities of the heat maps: temperatures in C, power in kW, and inlet less supply air in K."""
+HALL_QUANTITIES = ("inlet", "outlet")
+"""Quantities of the 3D hall, in C."""
 MAP_EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0), (np.inf, 6.0))
 """Interval of heat maps in h, by the largest number of racks in focus; 0 h is every step."""
 HALL_EVERY_H, HALL_EVERY_H_IN_EVENTS = 3.0, 1.0
@@ -120,7 +124,7 @@ class Block:
     map_steps: I64
     """Steps of the M heat maps, (M,)."""
     maps: dict[str, Reals]
-    """Rack values of heat maps, (M, R), by quantity: inlet and outlet in C, power in kW."""
+    """Rack values of heat maps, (M, R), by quantity of ``MAP_QUANTITIES``."""
     hall_steps: I64
     """Steps of the H frames of the 3D hall, (H,)."""
     halls: dict[str, Reals]
@@ -146,6 +150,8 @@ class BlockBuilder:
         self._age_edges = np.array(AGE_EDGES_H) * fleet.steps_per_hour
         self._pick_racks, self.racks = _pick(fleet.rack_offsets, focus)
         """Fleet indices of the racks in focus, and each data center's slice of these racks."""
+        self._dc_of_racks = fleet.rack_dc[self._pick_racks]
+        """Data center of each rack in focus."""
         self._pick_units, self.units = _pick(fleet.unit_offsets, focus)
         """Fleet indices of the CRAC units in focus, and each data center's slice of these units."""
         if cadence.has_servers:
@@ -158,7 +164,7 @@ class BlockBuilder:
             ])  # fmt: skip
             """Index into the servers in focus of the first server of each level of each rack."""
         shapes = [rasters.tile_grid(fleet.configs[dc].hall).image_shape for dc in focus]
-        self._map_bytes = 2 * len(rasters.COLOURMAPS) * sum(map(math.prod, shapes))
+        self._map_bytes = len(MAP_QUANTITIES) * sum(map(math.prod, shapes))
         racks = np.diff(fleet.rack_offsets)[self._focus]
         ends = np.cumsum([0, *(racks * cadence.levels)]).tolist()
         self.levels = list(itertools.starmap(slice, itertools.pairwise(ends)))
@@ -250,9 +256,9 @@ class BlockBuilder:
             unit_flow_m3s=flow_m3s,
             rewards=np.stack(rewards, axis=1) if rewards else None,
             map_steps=np.array(self._map_steps, dtype=np.int64),
-            maps=_by_quantity(rasters.COLOURMAPS, maps),
+            maps=_by_quantity(MAP_QUANTITIES, maps),
             hall_steps=np.array(self._hall_steps, dtype=np.int64),
-            halls=_by_quantity(rasters.TEMPERATURE_RANGES_C, halls),
+            halls=_by_quantity(HALL_QUANTITIES, halls),
             entries=self._entries,
         )
         self._clear()
@@ -338,7 +344,8 @@ class BlockBuilder:
         inlet_c, outlet_c, cpu_w, fan_w = (
             values[self._pick_racks].astype(np.float32) for values in fields
         )
-        self._maps.append(np.stack([inlet_c, outlet_c, (cpu_w + fan_w) * np.float32(1e-3)]))
+        rise_k = inlet_c - result.supply_c.astype(np.float32)[self._dc_of_racks]
+        self._maps.append(np.stack([inlet_c, outlet_c, (cpu_w + fan_w) * np.float32(1e-3), rise_k]))
         self._bytes += self._map_bytes
         self._map_steps.append(result.step)
 

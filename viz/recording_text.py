@@ -20,7 +20,7 @@ from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, QUANTITIES, Reals, Status
 
-from .hall_rasters import ColourScale
+from .colour_scales import ColourScale
 from .recording_series import FIELD_ROWS
 
 if TYPE_CHECKING:
@@ -287,7 +287,7 @@ def summary_markdown(
     description: Mapping[str, Any],
     fleet: Fleet,
     focus: Mapping[int, str],
-    scales: Mapping[str, ColourScale],
+    scales: Mapping[int, Mapping[str, ColourScale]],
     cadence: Cadence,
 ) -> str:
     """Return a Markdown text about the run and its inputs, and about how to read the recording.
@@ -296,11 +296,13 @@ def summary_markdown(
         description: result of ``describe_run``, or a part of it.
         fleet: the fleet.
         focus: name in the recording of each data center in focus, keyed by its index.
-        scales: colour scales of the heat maps, keyed by quantity.
+        scales: colour scales of the heat maps by quantity, of each data center in focus.
         cadence: how often and how finely heat maps and 3D halls are recorded.
     """
-    ranges = ", ".join(f"{name} {s.low:g} to {s.high:g} {s.unit}" for name, s in scales.items())
-    resolution = ", ".join(f"{name} {s.resolution:.4g} {s.unit}" for name, s in scales.items())
+    # Ranges are the same in all data centers in focus.
+    of_maps = next(iter(scales.values())).items()
+    ranges = ", ".join(f"{name} {s.low:g} to {s.high:g} {s.unit}" for name, s in of_maps)
+    resolution = ", ".join(f"{name} {s.resolution:.4g} {s.unit}" for name, s in of_maps)
     map_every = _steps_text(cadence.map_every_steps)
     hall_every = _steps_text(cadence.hall_every_steps)
     in_events = _steps_text(cadence.hall_every_steps_in_events)
@@ -316,7 +318,9 @@ def summary_markdown(
         f"inlet {_levels_text(cadence)}, in the colours of the maps; aisles are rounded to half a "
         "rack's depth.",
         "",
-        f"Colours cover: {ranges}; values beyond are drawn as its ends. Resolution: {resolution}.",
+        f"Colours cover: {ranges}; values beyond are drawn in the colours of its ends. The colours "
+        f"of inlets jump at {_limits_text(scales, focus)}. Resolution: {resolution}. A pointer on "
+        "a map names rack and value.",
         "",
         _INPUTS_TEXTS[description.get("synthetic")],
         "",
@@ -336,6 +340,17 @@ def summary_markdown(
         rest = _count_text(fleet.size - len(focus), "other data center")
         lines += ["", f"The {rest} count in the fleet series only."]
     return "\n".join(lines)
+
+
+def _limits_text(scales: Mapping[int, Mapping[str, ColourScale]], names: Mapping[int, str]) -> str:
+    """Return the limits of inlets that colours mark, in C, for each data center if they differ."""
+    texts = {
+        names[dc]: ", ".join(f"{value:g} C ({name})" for value, name in of_dc["inlet"].marks)
+        for dc, of_dc in scales.items()
+    }
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values())) or "no limit, as none is within the range"
+    return "; ".join(f"{text} of {name}" for name, text in texts.items())
 
 
 def _count_text(number: int, noun: str) -> str:

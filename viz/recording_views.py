@@ -12,11 +12,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from sdc_taichi.config import HallConfig
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.sim.fleet import Fleet
 
 from . import hall_rasters as rasters
-from .hall_rasters import ColourScale
+from .colour_scales import ColourScale, colours_of, labels
 from .recording_series import (
     COMMAND_STATES,
     FLEET_PLOTS,
@@ -29,12 +30,20 @@ from .recording_series import (
     REWARDS_ENTITY,
     STATE_COLOURS,
 )
+from .recording_text import rack_place
 
 PLAYBACK_S_PER_S = 14_400.0
 """Simulated seconds per second of playback."""
 MAX_UNIT_LINES = 24
 """Largest number of CRAC units with one line each; for more, plots show minimum, mean, maximum."""
 
+MAP_TITLES = {
+    "inlet": "rack inlet",
+    "rise": "rack inlet less supply air",
+    "outlet": "rack outlet",
+    "power": "rack power",
+}
+"""Titles of the maps, keyed by quantity."""
 MAX_ROW_LABELS = 5
 """Largest number of labels of rows in the 3D hall; more labels would cover each other."""
 _LABEL_RGB = (135, 135, 135)  # a grey that is legible on dark and on light backgrounds
@@ -167,15 +176,17 @@ def _series_view(tab: FocusTab, entity: str) -> Any:
 def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
     """Return the view of a heat map of racks, with its colour bar below."""
     bar = rrb.Spatial2DView(
-        origin=f"legend/{quantity}",
-        name=f"{quantity} scale, {scale.low:g} to {scale.high:g} {scale.unit}",
-        visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-2, 24)),
+        origin=f"{tab.path}/legend/{quantity}",
+        name=f"{MAP_TITLES[quantity]}, {scale.low:g} to {scale.high:g} {scale.unit}",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
     )
     height, width = tab.image_shape
     edge = 0.04 * max(height, width)
     image = rrb.Spatial2DView(
         origin=f"{tab.path}/map/{quantity}",
-        name=f"rack {quantity} [{scale.unit}]",
+        # A pointer on the map names the rack, from the map of names behind it.
+        contents=["$origin/**", f"+ {tab.path}/map/racks"],
+        name=f"{MAP_TITLES[quantity]} [{scale.unit}]",
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-edge, width + edge), y_range=(-edge, height + edge)
         ),
@@ -233,14 +244,8 @@ def _whole_run() -> Any:
     return rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
 
 
-def fleet_entities(scales: dict[str, ColourScale]) -> Entities:
-    """Yield the static entities of the fleet: colour bars and line styles.
-
-    Args:
-        scales: colour scales of the heat maps, keyed by quantity.
-    """
-    for quantity, scale in scales.items():
-        yield from _colour_bar(quantity, scale).items()
+def fleet_entities() -> Entities:
+    """Yield the static entities of the fleet: line styles."""
     for entity, plot in FLEET_PLOTS.items():
         yield f"fleet/{entity}", _lines([plot.title], [plot.colour])
 
@@ -249,7 +254,7 @@ def data_center_entities(
     fleet: Fleet,
     dc: int,
     path: str,
-    scales: dict[str, ColourScale],
+    scales: Mapping[str, ColourScale],
     levels: int,
     rewards: Sequence[str],
 ) -> Entities:
@@ -280,27 +285,49 @@ def data_center_entities(
     for entity, (_, states) in COMMAND_STATES.items():
         shown = rr.StateConfiguration(values=states, labels=states, colors=state_colours)
         yield f"{path}/actions/{entity}", shown
-    height, width = rasters.tile_grid(fleet.configs[dc].hall).image_shape
-    image_format = rr.components.ImageFormat(
-        width=width, height=height, color_model="L", channel_datatype="F16"
-    )
+    yield from _map_entities(fleet.configs[dc].hall, path, scales)
+    yield from _hall_entities(fleet, dc, f"{path}/hall", levels, units)
+
+
+def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]) -> Entities:
+    """Yield the static entities of the maps of a hall: classes, colour bars, names of racks.
+
+    Args:
+        hall: the hall.
+        path: path of the data center in the recording.
+        scales: colour scales of the maps, keyed by quantity.
+    """
+    grid = rasters.tile_grid(hall)
+    height, width = grid.image_shape
     for quantity, scale in scales.items():
-        image = rr.DepthImage.from_fields(
-            format=image_format,
-            colormap=rasters.COLOURMAPS[quantity],
-            depth_range=(scale.low, scale.high),
-            meter=1.0,
-            magnification_filter="Nearest",
+        image_format = rr.components.ImageFormat(
+            width=width, height=height, color_model="L", channel_datatype="U8"
         )
+        yield f"{path}/map/{quantity}", _classes(scale)
+        image = rr.SegmentationImage.from_fields(format=image_format, opacity=1.0)
         yield f"{path}/map/{quantity}", image
-    yield from _hall_entities(fleet, dc, f"{path}/hall", scales, levels, units)
+        yield from _colour_bar(f"{path}/legend/{quantity}", scale)
+    per_row = hall.racks_per_row
+    if hall.racks <= rasters.MAX_NAMED_RACKS:
+        names = [rack_place(rack, per_row) for rack in range(hall.racks)]
+    else:
+        names = [
+            f"row {row}, racks {row * per_row} to {(row + 1) * per_row - 1}"
+            for row in range(hall.rows)
+        ]
+    # Names are drawn in no colour behind the maps, only for the pointer.
+    invisible = [rr.AnnotationInfo(i, name, (0, 0, 0, 0)) for i, name in enumerate(names, 1)]
+    yield f"{path}/map/racks", rr.AnnotationContext(invisible)
+    yield (
+        f"{path}/map/racks",
+        rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0),
+    )
 
 
 def _hall_entities(
     fleet: Fleet,
     dc: int,
     path: str,
-    scales: dict[str, ColourScale],
     levels: int,
     units: int,
 ) -> Entities:
@@ -310,7 +337,6 @@ def _hall_entities(
         fleet: the fleet.
         dc: index of the data center.
         path: path of the hall in the recording.
-        scales: colour scales of the heat maps, keyed by quantity.
         levels: number of levels per rack.
         units: number of CRAC units.
     """
@@ -320,8 +346,6 @@ def _hall_entities(
         voxels = rr.VoxelGridMap.from_fields(
             voxel_indices=cells.astype(np.int32),
             voxel_size=grid.size_m,
-            value_range=(scales[quantity].low, scales[quantity].high),
-            colormap=rasters.COLOURMAPS[quantity],
             translation=(hall.layout.end_margin_m, 0.0, 0.0),
         )
         yield f"{path}/{quantity}", voxels
@@ -373,25 +397,41 @@ def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
     return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
-def _colour_bar(quantity: str, scale: ColourScale) -> dict[str, Any]:
-    """Return the entities of a colour bar: a gradient, and points labelled with values.
+def _classes(scale: ColourScale) -> rr.AnnotationContext:
+    """Return Rerun's description of the colours and names of the classes of a scale."""
+    colours, names = colours_of(scale)[1:].tolist(), labels(scale)
+    # Class 0, of gaps and of missing values, has no colour.
+    infos = [rr.AnnotationInfo(0, "no rack", (0, 0, 0, 0))]
+    for index, (name, colour) in enumerate(zip(names, colours, strict=True), 1):
+        infos.append(rr.AnnotationInfo(index, name, colour))
+    return rr.AnnotationContext(infos)
+
+
+def _colour_bar(path: str, scale: ColourScale) -> Entities:
+    """Yield the entities of a colour bar: a gradient, and points labelled with values.
 
     The viewer has no colour bars of its own.
+
+    Args:
+        path: path of the colour bar.
+        scale: the colour scale.
     """
-    gradient, marks = rasters.colour_bar(scale)
+    gradient, ticks = rasters.colour_bar(scale)
     height, width = gradient.shape
-    bar = rr.DepthImage(
-        gradient,
-        meter=1.0,
-        colormap=rasters.COLOURMAPS[quantity],
-        depth_range=(scale.low, scale.high),
-    )
-    x = (np.array(marks) - scale.low) / (scale.high - scale.low) * width
-    points = rr.Points2D(
-        np.stack([x, np.full_like(x, height + 2.0)], axis=1),
-        radii=rr.Radius.ui_points(1.5),
-        colors=_LABEL_RGB,
-        labels=[f"{mark:g} {scale.unit}" for mark in marks],
-        show_labels=True,
-    )
-    return {f"legend/{quantity}/bar": bar, f"legend/{quantity}/ticks": points}
+    yield f"{path}/bar", _classes(scale)
+    yield f"{path}/bar", rr.SegmentationImage(gradient, opacity=1.0)
+
+    def points(values: Sequence[float], texts: Sequence[str], y: float) -> rr.Points2D:
+        x = (np.array(values) - scale.low) / (scale.high - scale.low) * width
+        return rr.Points2D(
+            np.stack([x, np.full_like(x, y)], axis=1),
+            radii=rr.Radius.ui_points(1.5),
+            colors=_LABEL_RGB,
+            labels=texts,
+            show_labels=True,
+        )
+
+    yield f"{path}/ticks", points(ticks, [f"{tick:g} {scale.unit}" for tick in ticks], height + 2.0)
+    if scale.marks:
+        texts = [f"{name} {value:g}" for value, name in scale.marks]
+        yield f"{path}/limits", points([value for value, _ in scale.marks], texts, -8.0)

@@ -2,13 +2,14 @@
 
 A recording has these entities, where NAME is the name of a data center in focus:
 
-    dc/NAME/map/{inlet,outlet,power}   heat maps, a tile per rack
+    dc/NAME/map/{inlet,outlet,...}     heat maps, a tile per rack
     dc/NAME/hall/{inlet,outlet}        3D hall, a voxel per rack and level
     dc/NAME/series/..., crac/...       series, each entity with lines of one unit
     dc/NAME/actions/...                commands, as states
     dc/NAME/events                     log of events
     fleet/...                          sums and maxima over all data centers
-    legend/..., summary                static colour bars and text
+    dc/NAME/legend/...                 static colour bars of the maps
+    summary                            static text
 
 Its timelines are ``step``, counted from 0 at reset, and ``sim_time``, the start of the step on the
 clock of the data center (see ``year_clock.step_times``). Entities of the fleet use the clock of
@@ -26,10 +27,13 @@ import numpy.typing as npt
 import rerun as rr
 
 from sdc_taichi.exogenous.year_clock import step_times
+from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, StepResult
 
+from . import colour_scales
 from . import hall_rasters as rasters
+from .colour_scales import ColourScale, InletRange
 from .recording_blocks import Block, BlockBuilder, choose_cadence
 from .recording_output import RecordingOutput
 from .recording_series import (
@@ -55,6 +59,7 @@ if TYPE_CHECKING:
 
 LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
 """Longest time between two blocks, in s of real time: of a live recording, and of a file."""
+_MEANS_OF_MAPS = {"inlet": "inlet_mean_c", "outlet": "outlet_mean_c", "rise": "inlet_mean_c"}
 _NO_COMMAND = 2
 """Placeholder for the sign of a command before the first step; differs from -1, 0 and 1."""
 
@@ -70,6 +75,7 @@ class RecordingWriter:
         output: destination of the recording.
         every_steps: interval of heat maps and of frames of the 3D hall, in steps; None derives it
             from the number of racks in focus.
+        inlet_range: range of the colours of inlets, see ``colour_scales.inlet_scale``.
     """
 
     def __init__(
@@ -80,6 +86,7 @@ class RecordingWriter:
         description: Mapping[str, Any],
         output: RecordingOutput,
         every_steps: int | None,
+        inlet_range: InletRange = None,
     ) -> None:
         fleet = sim.fleet
         self._fleet, self._description, self._output = fleet, description, output
@@ -91,11 +98,8 @@ class RecordingWriter:
             entity: ([FIELD_ROWS[f] for _, f, _ in plot.lines], line_factors(plot, sim.step_h))
             for entity, plot in PLOTS.items()
         }
-        self._scales = {
-            quantity: rasters.temperature_scale(quantity)
-            for quantity in rasters.TEMPERATURE_RANGES_C
-        }
-        self._scales["power"] = rasters.power_scale(fleet)
+        self._inlet_range = inlet_range
+        self._scales: list[dict[str, ColourScale]] = []
         self._tile_grids = [rasters.tile_grid(fleet.configs[dc].hall) for dc in focus]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
         self._last_signs: dict[tuple[int, str], int] = {}
@@ -147,6 +151,7 @@ class RecordingWriter:
         if not self._output.has_room_for(block.size_bytes):
             return
         if not self._output.is_open:
+            self._scales = [self._scales_of(block, index) for index in range(len(self._focus))]
             self._open()
         times, map_times, hall_times = map(
             self._times, (block.steps, block.map_steps, block.hall_steps)
@@ -163,24 +168,53 @@ class RecordingWriter:
     def _open(self) -> None:
         """Open the output and send the static entities."""
         tabs = []
-        for dc, grid in zip(self._focus, self._tile_grids, strict=True):
+        for index, (dc, grid) in enumerate(zip(self._focus, self._tile_grids, strict=True)):
             hall = self._fleet.configs[dc].hall
             plan = floor_plan(hall)
             size_m = plan.length_m, plan.width_m, hall.layout.ceiling_m
             name, path = self._names[dc], self._path(dc)
-            tabs.append(FocusTab(name, path, size_m, self._scales, grid.image_shape))
+            tabs.append(FocusTab(name, path, size_m, self._scales[index], grid.image_shape))
         rewards = self._builder.reward_names or ()
         self._output.open(make_blueprint(tabs, has_rewards=bool(rewards)))
         names = {dc: self._names[dc] for dc in self._focus}
-        text = summary_markdown(self._description, self._fleet, names, self._scales, self._cadence)
+        scales = dict(zip(self._focus, self._scales, strict=True))
+        text = summary_markdown(self._description, self._fleet, names, scales, self._cadence)
         self._output.send_static("summary", rr.TextDocument(text, media_type="text/markdown"))
-        for entity, component in fleet_entities(self._scales):
+        for entity, component in fleet_entities():
             self._output.send_static(entity, component)
         for dc, levels in zip(self._focus, self._cadence.levels, strict=True):
             for entity, component in data_center_entities(
-                self._fleet, dc, self._path(dc), self._scales, levels, rewards
+                self._fleet, dc, self._path(dc), scales[dc], levels, rewards
             ):
                 self._output.send_static(entity, component)
+
+    def _scales_of(self, block: Block, index: int) -> dict[str, ColourScale]:
+        """Return the colour scales of the maps of a data center, from the first block.
+
+        Ranges are those of all data centers in focus, so that their maps compare.
+
+        Args:
+            block: the first block.
+            index: index of the data center among those in focus.
+        """
+        classes = [self._fleet.configs[dc].protection.ashrae_class for dc in self._focus]
+        limits_c = [allowable_c(name)[1] for name in classes]
+        first = block.maps or {
+            quantity: block.values[:, FIELD_ROWS[field]]
+            for quantity, field in _MEANS_OF_MAPS.items()
+        }
+        inlets = colour_scales.inlet_scale(
+            self._inlet_range,
+            first["inlet"],
+            (limits_c[index], max(limits_c)),
+            classes[index] or USUAL_CLASS,
+        )
+        return {
+            "inlet": inlets,
+            "rise": colour_scales.difference_scale(first["rise"]),
+            "outlet": colour_scales.outlet_scale(self._inlet_range, first["outlet"]),
+            "power": colour_scales.power_scale(self._fleet),
+        }
 
     def _write_fleet(self, block: Block, times: list[rr.TimeColumn]) -> None:
         """Write the series of the whole fleet."""
@@ -278,15 +312,16 @@ class RecordingWriter:
             hall_times: time columns of the frames of the 3D hall.
         """
         racks, levels = self._builder.racks[index], self._builder.levels[index]
+        scales, grid = self._scales[index], self._tile_grids[index]
         for quantity, values in block.maps.items():
-            scale = self._scales[quantity]
-            frames = rasters.heat_maps(values[:, racks], self._tile_grids[index], scale)
-            pixels = frames.reshape(len(frames), -1).view(np.uint8)
-            columns = rr.DepthImage.columns(buffer=pixels)
+            classes = colour_scales.classes_of(values[:, racks], scales[quantity])
+            frames = rasters.heat_maps(classes, grid)
+            columns = rr.SegmentationImage.columns(buffer=frames.reshape(len(frames), -1))
             self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
         for quantity, values in block.halls.items():
-            voxels = rasters.quantised(values[:, levels], self._scales[quantity])
-            columns = rr.VoxelGridMap.columns(values=voxels.reshape(-1))
+            colours = colour_scales.colours_of(scales[quantity])
+            voxels = colours[colour_scales.classes_of(values[:, levels], scales[quantity])]
+            columns = rr.VoxelGridMap.columns(colors=voxels.reshape(-1))
             parts = columns.partition(np.full(len(voxels), voxels.shape[1]))
             self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
 

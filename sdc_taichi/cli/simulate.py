@@ -63,6 +63,14 @@ class RecordingOptions:
         int | None,
         typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
     ] = None
+    inlet_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW:HIGH|same",
+            help="Inlets that the colours of recorded maps cover, in C; same is 10:45. "
+            "[default: what the halls use]",
+        ),
+    ] = None
     serve: Annotated[
         bool,
         typer.Option("--serve", help="Let viewers of this machine watch the run, until Ctrl-C."),
@@ -87,12 +95,18 @@ class RecordingOptions:
         if self.serve or port is not None:
             port = DEFAULT_PORT if port is None else port
         elif self.record is None:
-            for name, value in (("--focus", self.focus), ("--every", self.every)):
+            only_recorded = {
+                "--focus": self.focus,
+                "--every": self.every,
+                "--inlet-range": self.inlet_range,
+            }
+            for name, value in only_recorded.items():
                 if value is not None:
                     raise ConfigError(
                         f"{name}: given without a recording; valid with --record, --serve"
                     )
             return None
+        from sdc_taichi.viz.colour_scales import parse_inlet_range
         from sdc_taichi.viz.recorder import Recorder
 
         target = self.record
@@ -100,7 +114,10 @@ class RecordingOptions:
             with contextlib.suppress(OSError):  # the recorder reports the error
                 Path(target).parent.mkdir(parents=True, exist_ok=True)
         names = None if self.focus is None else [name.strip() for name in self.focus.split(",")]
-        return Recorder(target, focus=names, every=self.every, serve_port=port)
+        inlet_range = None if self.inlet_range is None else parse_inlet_range(self.inlet_range)
+        return Recorder(
+            target, focus=names, every=self.every, serve_port=port, inlet_range=inlet_range
+        )
 
 
 def simulate_command(

@@ -21,7 +21,8 @@ Guidelines, 2021)."""
 TIE_K = 0.05
 """Temperature difference up to which racks count as equally hot, in K; it is invisible in figures
 with one decimal."""
-_USUAL_CLASS = "A2"
+USUAL_CLASS = "A2"
+"""Server class of data centers without a class of their own."""
 LEAST_EXCESS_K = 1e-5
 """Smallest excess over a temperature limit that counts, in K. An f32 inlet temperature equal to the
 limit may exceed it by a rounding error of 4e-6 K."""
@@ -34,7 +35,7 @@ _NO_AIRFLOW_M3S = 1e-9
 
 def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
     """Return the lowest and highest allowable inlet of an ASHRAE class, in C; None means A2."""
-    return ALLOWABLE_C[ashrae_class or _USUAL_CLASS]
+    return ALLOWABLE_C[ashrae_class or USUAL_CLASS]
 
 
 def rank(temperature_c: Reals) -> F64:
