@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sdc_taichi.config.hvac_schema import CracConfig
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I64
 
 _MOST_PASSES, _LEAST_PASSES = 200, 20
 _MOST_PRODUCTS = 2e8
@@ -20,6 +20,8 @@ _WITHIN = 1e-13
 """Relative difference up to which the airflow of a unit and the airflow taken from it are equal."""
 _LEAST_WEIGHT = 1e-12
 """Smallest weight of a unit; a positive value keeps a rack supplied that has only one unit."""
+_RACKS_AT_ONCE = 1024
+"""Number of racks whose shares are compared at once, so that the shares stay in the cache."""
 
 
 def full_airflow_m3s(crac: CracConfig, need_m3s: F64, design_m3s: float) -> F64:
@@ -84,6 +86,28 @@ def weighted_shares(shares: F64, weight: F64) -> F64:
         return shares
     weighted = shares * weight
     return np.asarray(weighted / weighted.sum(axis=1, keepdims=True))
+
+
+def largest_shares(shares: F64, strength: F64) -> tuple[I64, F64]:
+    """Return the unit that gives each rack most of its supply air, and its share, (R,) each.
+
+    The share of unit k in the supply of rack j is s_jk a_k / sum_l s_jl a_l; it is 0 for racks
+    that no unit supplies.
+
+    Args:
+        shares: Shares s of the units, (R, U).
+        strength: Factor a of each unit, from 0, (U,).
+    """
+    racks = len(shares)
+    unit, share = np.zeros(racks, dtype=np.int64), np.zeros(racks)
+    for first in range(0, racks, _RACKS_AT_ONCE):
+        block = slice(first, first + _RACKS_AT_ONCE)
+        part = shares[block] * strength
+        unit[block] = part.argmax(axis=1)
+        total = part.sum(axis=1)
+        largest = np.take_along_axis(part, unit[block, None], axis=1)[:, 0]
+        share[block] = largest / np.where(total > 0.0, total, 1.0)
+    return unit, share
 
 
 def airflow_with_losses_m3s(

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.hall.air_metrics import rank
-from sdc_taichi.hall.unit_supply import weighted_shares
+from sdc_taichi.hall.unit_supply import largest_shares, weighted_shares
 from sdc_taichi.kernels.hall_arguments import GROUP_INPUTS, RACK_OUT
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_tables import HallTables
-from sdc_taichi.types import F64, fields_of
+from sdc_taichi.types import F64, I64, fields_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +262,13 @@ class Inlets:
         hottest_c = np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1])
         order = np.argsort(-rank(hottest_c), kind="stable")
         return [int(rack) for rack in order[:most]]
+
+    def main_units(self) -> tuple[I64, F64]:
+        """Return the CRAC unit that gives each rack most of its supply air, and its share, (R,).
+
+        Units are counted from 0 in their hall; shares are 0..1, and 0 where no unit gives air.
+        """
+        return largest_shares(self._shares, self._air.fresh_ratio)
 
     def parts(self, rack: int) -> InletParts:
         """Split the inlet temperature of a rack's hottest server into parts."""
