@@ -64,8 +64,12 @@ def test_the_parts_add_up_to_the_inlets_of_the_kernels(name: str) -> None:
         ends = sim.fleet.group_offsets[: config.hall.racks + 1]
         hottest_c = np.maximum.reduceat(groups_c, ends[:-1])
         inlets = Inlets(sim.fleet, 1, intake_air_of(sim.fleet, sim.intake_air(), 1))
+    main_unit, main_share = inlets.main_units()
+    assert inlets.hottest(3) == inlets.hottest(config.hall.racks)[:3]
     for rack in {0, 7, config.hall.racks - 1, *inlets.hottest(3)}:
         parts = inlets.parts(rack)
+        assert main_share[rack] == pytest.approx(parts.unit_share.max())
+        assert parts.unit_share[main_unit[rack]] == pytest.approx(main_share[rack])
         assert parts.inlet_c == pytest.approx(hottest_c[rack], abs=1e-9)
         assert total_c(parts) == pytest.approx(hottest_c[rack], abs=1e-9)
         why_k = parts.layout_k + parts.height_k + parts.shortfall_k + parts.approach_k

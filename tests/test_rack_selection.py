@@ -8,6 +8,7 @@ import pytest
 from sdc_taichi import load_config
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.rack_selection import default_racks, parse_racks
+from sdc_taichi.hall.zones import MOST_ZONES, RACKS_PER_ZONE, hall_zones, zone_text
 
 HALL = load_config("corrected").hall
 INLET_C = np.array([20.0, 21.0, 25.0, 22.0, 25.0, *np.linspace(10.0, 17.0, 15)])
@@ -20,6 +21,7 @@ INLET_C = np.array([20.0, 21.0, 25.0, 22.0, 25.0, *np.linspace(10.0, 17.0, 15)])
         (" 7 , 3 ", [7, 3]),
         ("1:2", [7]),
         ("row:3", [15, 16, 17, 18, 19]),
+        ("zone:0", list(range(20))),
         ("hottest:3", [2, 4, 3]),
         ("hottest:1,row:0", [2, 0, 1, 3, 4]),
         ("median", [14]),
@@ -47,7 +49,7 @@ def test_by_default_racks_are_the_ten_hottest_and_the_median() -> None:
     assert len(few) == min(tiny.racks, 11)
 
 
-@pytest.mark.parametrize("text", ["", "x", "7,", "row:", "row:x", "hottest", "1:2:3", "7-9", "²"])
+@pytest.mark.parametrize("text", ["", "x", "7,", "row:", "row:x", "zone:", "hottest", "1:2:3", "7-9", "²"])
 def test_unknown_terms_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"--racks .*: valid are RACK, ROW:PLACE, row:ROW"):
         parse_racks(text)
@@ -60,6 +62,7 @@ def test_unknown_terms_are_refused(text: str) -> None:
         ("-1", r"valid is 0\.\.19"),
         ("4:0", r"valid is 0\.\.3:0\.\.4"),
         ("row:4", r"valid is row:0\.\.3"),
+        ("zone:1", r"valid is zone:0\.\.0"),
         ("hottest:0", r"valid is hottest:1\.\.20"),
         ("1,hottest:21", r"'hottest:21': the hall of ny has 4 rows of 5 racks"),
     ],
@@ -68,3 +71,28 @@ def test_racks_that_a_hall_does_not_have_are_refused(text: str, valid: str) -> N
     selection = parse_racks(text, "--racks")
     with pytest.raises(ConfigError, match=valid):
         selection.check(HALL, "ny")
+
+
+@pytest.mark.parametrize(
+    ("rows", "per_row"), [(4, 5), (3, 7), (12, 18), (33, 77), (1, 1000), (1000, 1), (320, 320)]
+)
+def test_zones_are_blocks_of_rows_that_divide_the_hall(rows: int, per_row: int) -> None:
+    size = [f"hall.rows={rows}", f"hall.racks_per_row={per_row}", "hall.servers_per_rack=1"]
+    hall = load_config("large", size).hall
+    zones = hall_zones(hall)
+    inlet_c = np.random.default_rng(0).normal(24.0, 2.0, (2, hall.racks))
+    racks = [zones.racks(zone) for zone in range(zones.count)]
+    np.testing.assert_array_equal(np.sort(np.concatenate(racks)), np.arange(hall.racks))
+    assert 1 <= zones.count <= MOST_ZONES
+    assert zones.count == 1 or hall.racks / zones.count >= RACKS_PER_ZONE
+    assert zones.count == 1 or max(map(len, racks)) <= 2.5 * min(map(len, racks))
+    for zone, chosen in enumerate(racks):
+        highest, mean = zones.highest(inlet_c)[:, zone], zones.mean(inlet_c)[:, zone]
+        np.testing.assert_array_equal(highest, inlet_c[:, chosen].max(axis=1))
+        np.testing.assert_allclose(mean, inlet_c[:, chosen].mean(axis=1), rtol=1e-12)
+        selected = parse_racks(f"zone:{zone}")
+        selected.check(hall)
+        np.testing.assert_array_equal(selected.racks(hall), chosen)
+        row, place = divmod(int(chosen[0]), per_row)
+        assert zone_text(zones, zone).startswith(f"zone {zone}: rows {row} to ")
+        assert f"places {place} to" in zone_text(zones, zone) or place == 0

@@ -7,6 +7,7 @@ The terms of a selection are separated by commas:
 | ``7`` | rack 7, counted from 0 over the hall |
 | ``2:5`` | the rack at place 5 of row 2, both counted from 0 |
 | ``row:3`` | all racks of row 3 |
+| ``zone:3`` | all racks of zone 3, see ``hall.zones`` |
 | ``hottest:10`` | the ten racks with the warmest inlets, warmest first |
 | ``median`` | the rack with the median inlet |
 """
@@ -21,12 +22,13 @@ import numpy as np
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.hall.air_metrics import rank
+from sdc_taichi.hall.zones import hall_zones
 from sdc_taichi.number_text import parse_whole
 from sdc_taichi.types import I64, Reals
 
 HOTTEST_BY_DEFAULT = 10
 """Number of hottest racks in ``default_racks``."""
-VALID_TERMS = "RACK, ROW:PLACE, row:ROW, hottest:COUNT or median, separated by commas"
+VALID_TERMS = "RACK, ROW:PLACE, row:ROW, zone:ZONE, hottest:COUNT or median, separated by commas"
 """Valid terms of a selection, for help texts and errors."""
 
 
@@ -34,9 +36,9 @@ class Term(NamedTuple):
     """One term of a selection."""
 
     kind: str
-    """``rack``, ``place``, ``row``, ``hottest`` or ``median``."""
+    """``rack``, ``place``, ``row``, ``zone``, ``hottest`` or ``median``."""
     numbers: tuple[int, ...]
-    """Numbers of the term: rack, row and place, row, or count."""
+    """Numbers of the term: rack, row and place, row, zone, or count."""
     text: str
     """The term as the user wrote it."""
 
@@ -93,6 +95,8 @@ class RackSelection:
             elif kind == "row":
                 first = numbers[0] * hall.racks_per_row
                 indices.extend(range(first, first + hall.racks_per_row))
+            elif kind == "zone":
+                indices.extend(hall_zones(hall).racks(numbers[0]).tolist())
             else:
                 assert by_heat is not None, "inlet_c is needed"
                 middle = len(by_heat) // 2
@@ -145,7 +149,7 @@ def _term(text: str, option: str) -> Term:
     try:
         if text == "median":
             return Term("median", (), text)
-        if head in ("row", "hottest") and colon:
+        if head in ("row", "zone", "hottest") and colon:
             return Term(head, (parse_whole(tail),), text)
         if colon:
             return Term("place", (parse_whole(head), parse_whole(tail)), text)
@@ -158,6 +162,8 @@ def _term(text: str, option: str) -> Term:
 def _valid_numbers(term: Term, hall: HallConfig) -> tuple[tuple[int, int], ...]:
     """Return the lowest and highest valid value of each number of a term in a hall."""
     rows, places, racks = hall.rows - 1, hall.racks_per_row - 1, hall.racks
+    if term.kind == "zone":
+        return ((0, hall_zones(hall).count - 1),)
     return {
         "rack": ((0, racks - 1),),
         "place": ((0, rows), (0, places)),
@@ -170,7 +176,7 @@ def _valid_numbers(term: Term, hall: HallConfig) -> tuple[tuple[int, int], ...]:
 def _valid_text(term: Term, hall: HallConfig) -> str:
     """Return the valid numbers of a term in a hall as text."""
     ranges = ":".join(f"{low}..{high}" for low, high in _valid_numbers(term, hall))
-    return f"{term.kind}:{ranges}" if term.kind in ("row", "hottest") else ranges
+    return f"{term.kind}:{ranges}" if term.kind in ("row", "zone", "hottest") else ranges
 
 
 def _rack_index(numbers: tuple[int, ...], hall: HallConfig) -> int:

@@ -259,9 +259,14 @@ class Inlets:
 
     def hottest(self, most: int) -> list[int]:
         """Return the indices of the ``most`` racks with the hottest inlets, hottest first."""
-        hottest_c = np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1])
-        order = np.argsort(-rank(hottest_c), kind="stable")
-        return [int(rack) for rack in order[:most]]
+        ranked = rank(np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1]))
+        chosen = np.arange(self._racks)
+        if most < self._racks:
+            # Large halls are sorted only from the coldest of the chosen racks upwards.
+            coldest = np.partition(ranked, self._racks - most)[self._racks - most]
+            chosen = np.flatnonzero(ranked >= coldest)
+        order = np.argsort(-ranked[chosen], kind="stable")
+        return [int(rack) for rack in chosen[order][:most]]
 
     def main_units(self) -> tuple[I64, F64]:
         """Return the CRAC unit that gives each rack most of its supply air, and its share, (R,).
