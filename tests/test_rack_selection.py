@@ -49,7 +49,9 @@ def test_by_default_racks_are_the_ten_hottest_and_the_median() -> None:
     assert len(few) == min(tiny.racks, 11)
 
 
-@pytest.mark.parametrize("text", ["", "x", "7,", "row:", "row:x", "zone:", "hottest", "1:2:3", "7-9", "²"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "7,", "row:", "row:x", "zone:", "hottest", "1:2:3", "7-9", "²"]
+)
 def test_unknown_terms_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"--racks .*: valid are RACK, ROW:PLACE, row:ROW"):
         parse_racks(text)
