@@ -27,7 +27,9 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
+from sdc_taichi.cli.view import moment_of
 from sdc_taichi.control import View
+from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
@@ -233,10 +235,10 @@ def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
         for step, pixels in zip(entity["step"], shots, strict=True):
             result = run.results[step]
             racks_now = {
-                "inlet": result.rack_inlet_c,
+                "inlet": result.rack_inlet_max_c,
                 "outlet": result.rack_outlet_c,
                 "power": result.rack_power_w / 1e3,
-                "rise": result.rack_inlet_c - result.supply_c[fleet.rack_dc],
+                "rise": result.rack_inlet_max_c - result.supply_c[fleet.rack_dc],
             }[what][racks]
             for rack, value in enumerate(np.clip(racks_now, values[1], values[-1])):
                 row, column = divmod(rack, hall.racks_per_row)
@@ -261,6 +263,71 @@ def test_maps_name_their_racks(run: Run, dc: int) -> None:
     firsts = pixels[:: tiles.tile_height + 1, :: tiles.tile_width + 1].reshape(-1)
     shown = [names[number] for number in firsts.tolist()]
     assert shown == ["row 0, rack 0", "row 0, rack 1", "row 1, rack 2", "row 1, rack 3"]
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_maps_mark_the_hottest_rack(run: Run, dc: int) -> None:
+    racks = slice(*run.sim.fleet.rack_offsets[dc : dc + 2])
+    entity = run.recorded[f"/dc/{FOCUS[dc]}/map/hottest"]
+    assert entity["step"] == list(range(0, STEPS, 2))
+    for step, (label,) in zip(entity["step"], entity["LineStrips2D:labels"], strict=True):
+        inlet_c = run.results[step].rack_inlet_max_c[racks]
+        rack = int(np.argmax(rank(inlet_c)))
+        assert label == f"row {rack // 2}, rack {rack}: {inlet_c[rack]:.1f} C"
+
+
+def test_maps_mark_units_that_are_down(run: Run) -> None:
+    entity = run.recorded[f"/dc/{FOCUS[0]}/map/down"]
+    marks = dict(zip(entity["step"], entity["Points2D:labels"], strict=True))
+    assert marks == {12: ["CRAC 0 down"], 20: [], 24: ["CRAC 0 down", "CRAC 1 down"], 32: []}
+    assert f"/dc/{FOCUS[1]}/map/down" not in run.recorded or (
+        "step" not in run.recorded[f"/dc/{FOCUS[1]}/map/down"]
+    )
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_trends_are_those_of_the_hottest_racks(run: Run, dc: int) -> None:
+    fleet = run.sim.fleet
+    first = fleet.rack_offsets[dc]
+    inlet_c = np.array([r.rack_inlet_max_c[first : first + 4] for r in run.results])
+    peak_c = np.floor((inlet_c.max(axis=0) + 50.0) * 128 + 0.5)
+    order = np.argsort(-peak_c, kind="stable")
+    for entity, field, factor in (
+        ("inlet_c", "rack_inlet_max_c", 1.0),
+        ("outlet_c", "rack_outlet_c", 1.0),
+        ("power_kw", "rack_power_w", 1e-3),
+    ):
+        trend = run.recorded[f"/dc/{FOCUS[dc]}/racks/{entity}"]
+        assert trend["step"] == list(range(STEPS))
+        values = np.array([getattr(r, field)[first + order] for r in run.results]) * factor
+        np.testing.assert_allclose(scalars(trend), values, atol=0.004)
+        (names,) = trend["SeriesLines:names"]
+        assert [name.split(",")[1] for name in names] == [f" rack {rack}" for rack in order]
+
+
+def test_hottest_row_is_drawn_by_time(run: Run) -> None:
+    first = run.sim.fleet.rack_offsets[0]
+    inlet_c = np.array([r.rack_inlet_max_c[first : first + 4] for r in run.results])
+    step, rack = np.unravel_index(int(np.argmax(inlet_c)), inlet_c.shape)
+    row = run.recorded[f"/dc/{FOCUS[0]}/row/inlet"]
+    (pixels,) = images(row)
+    values, _ = classes(row)
+    down, across = pixels.shape[0] // 2, pixels.shape[1] // STEPS
+    shown = pixels[down // 2 :: down, across // 2 :: across].T
+    racks = slice(rack // 2 * 2, rack // 2 * 2 + 2)
+    expected = np.clip(inlet_c[:, racks], values[1], values[-1])
+    resolution = np.median(np.diff(values[1:]))
+    np.testing.assert_allclose(shown, expected, atol=resolution / 2 + 0.005)
+    ((mark,),) = run.recorded[f"/dc/{FOCUS[0]}/row/hottest"]["Points2D:labels"]
+    clock = str(run.column("time", 0)[step])
+    assert mark.startswith(f"row {rack // 2}, rack {rack}: {inlet_c.max():.1f} C, ")
+    assert mark.endswith(f"{clock[5:10]} {clock[11:16]}")
+
+
+def test_viewers_begin_at_the_hottest_step_of_the_first_event(run: Run) -> None:
+    hottest_c = np.array([[r.inlet_max_c[dc] for dc in FOCUS] for r in run.results])
+    step = 12 + int(np.argmax(hottest_c[12:20].max(axis=1)))
+    assert moment_of(run.path) == str(run.column("time", 0)[step])[:19]
 
 
 @pytest.mark.parametrize("dc", FOCUS)
@@ -408,7 +475,7 @@ def test_larger_halls_are_recorded_more_coarsely(
     assert inlets["step"] == list(range(0, 100, 4))
     tiles = hall_rasters.tile_grid(large.hall)
     pixels = images(inlets)[-1][:: tiles.tile_height + 1, :: tiles.tile_width + 1].reshape(-1)
-    np.testing.assert_allclose(pixels, results[96].rack_inlet_c, atol=0.0501)
+    np.testing.assert_allclose(pixels, results[96].rack_inlet_max_c, atol=0.0501)
     assert entities["/dc/ny/hall/outlet"]["step"] == list(range(0, 100, 12))
     assert voxels(entities["/dc/ny/hall/outlet"]).shape == (9, 300 * 5)
     from rerun.chunk import RrdReader

@@ -7,7 +7,7 @@ its label. Class 0 has no value and no colour; the others are values in equal st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,9 @@ from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 Classes = npt.NDArray[np.uint8]
 """Classes of values."""
@@ -144,6 +147,16 @@ def colours_of(scale: ColourScale) -> npt.NDArray[np.uint32]:
     red, green, blue = np.rint(rgb).astype(np.uint32).T
     opaque = red << 24 | green << 16 | blue << 8 | 0xFF
     return np.concatenate([np.zeros(1, np.uint32), opaque])
+
+
+def annotation_context(scale: ColourScale) -> rr.AnnotationContext:
+    """Return Rerun's description of the colours and names of the classes of a scale."""
+    import rerun as rr
+
+    infos = [rr.AnnotationInfo(0, "no rack", (0, 0, 0, 0))]
+    pairs = zip(labels(scale), colours_of(scale)[1:].tolist(), strict=True)
+    infos += [rr.AnnotationInfo(i, name, colour) for i, (name, colour) in enumerate(pairs, 1)]
+    return rr.AnnotationContext(infos)
 
 
 def parse_inlet_range(text: str) -> InletRange:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.hall.rack_selection import RackSelection, parse_racks
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.types import F64, StepResult
 
@@ -57,6 +58,8 @@ class Recorder:
         inlet_range: lowest and highest inlet of the colours of the maps, in C; ``"same"`` is 10 to
             45 C, for recordings that are compared; None is the range that the halls use at the
             beginning of the run, up to their allowable limit at least.
+        racks: racks whose trends are recorded, such as ``"7,row:3,hottest:10,median"`` (see
+            ``hall.rack_selection``); None records the ten hottest of the run and the median one.
 
     Raises:
         SdcError: rerun-sdk is missing, or an argument is not valid.
@@ -70,6 +73,7 @@ class Recorder:
         every: int | None = None,
         serve_port: int | None = None,
         inlet_range: InletRange = None,
+        racks: str | RackSelection | None = None,
     ) -> None:
         import_rerun()
         self._file: Path | None = None
@@ -89,6 +93,7 @@ class Recorder:
         if every is not None and not (is_whole and every > 0):
             raise SdcError(f"every {every!r}: valid is a positive integer")
         self._every = every
+        self._racks = parse_racks(racks, "racks") if isinstance(racks, str) else racks
         self._inlet_range = check_inlet_range(inlet_range)
         self._episodes = 0
         self._writer: RecordingWriter | None = None

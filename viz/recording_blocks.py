@@ -131,6 +131,8 @@ class Block:
     """Inlet and outlet of each level of each rack, floor to top, in C, (H, levels) each."""
     entries: list[LogEntry]
     """Entries of the event log, ordered by step."""
+    down: list[tuple[int, int, tuple[int, ...]]]
+    """Changes of the CRAC units that are down: step, data center, and units that are down."""
 
 
 class BlockBuilder:
@@ -177,6 +179,8 @@ class BlockBuilder:
             fleet.configs[dc].events.scheduled or fleet.configs[dc].events.sampled for dc in focus
         )
         self._active: list[ActiveEvent] = []
+        self.first_event: ActiveEvent | None = None
+        """First event of a data center in focus; None before it."""
         self._clear()
 
     def _clear(self) -> None:
@@ -190,6 +194,7 @@ class BlockBuilder:
         self._hall_steps: list[int] = []
         self._halls: list[F32] = []
         self._entries: list[LogEntry] = []
+        self._down: list[tuple[int, int, tuple[int, ...]]] = []
 
     @property
     def steps(self) -> int:
@@ -260,6 +265,7 @@ class BlockBuilder:
             hall_steps=np.array(self._hall_steps, dtype=np.int64),
             halls=_by_quantity(HALL_QUANTITIES, halls),
             entries=self._entries,
+            down=self._down,
         )
         self._clear()
         return block
@@ -325,7 +331,10 @@ class BlockBuilder:
         if self._has_events:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
             self._entries += failure_entries(step, self._active, active, fleet)
+            self._add_units_down(step, active)
             self._active = active
+            if active and self.first_event is None:
+                self.first_event = active[0]
         if status == self._last_status:
             return
         after = result.rack_status
@@ -338,9 +347,21 @@ class BlockBuilder:
                 step, dc, per_row, before[racks], after[racks], inlet_c
             )
 
+    def _add_units_down(self, step: int, active: Sequence[ActiveEvent]) -> None:
+        """Store the CRAC units of each data center that are down, if they have changed."""
+        for dc in self._focus:
+            before, now = (
+                [event.target for event in events if event.dc == dc and event.kind == "crac_down"]
+                for events in (self._active, active)
+            )
+            if before != now:
+                count = int(np.diff(self._fleet.unit_offsets)[dc])
+                units = range(count) if None in now else sorted({u for u in now if u is not None})
+                self._down.append((step, dc, tuple(units)))
+
     def _add_map(self, result: StepResult) -> None:
         """Store the rack values of the heat maps of a step."""
-        fields = result.rack_inlet_c, result.rack_outlet_c, result.rack_cpu_w, result.rack_fan_w
+        fields = result.rack_inlet_max_c, result.rack_outlet_c, result.rack_cpu_w, result.rack_fan_w
         inlet_c, outlet_c, cpu_w, fan_w = (
             values[self._pick_racks].astype(np.float32) for values in fields
         )

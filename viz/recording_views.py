@@ -17,7 +17,8 @@ from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.sim.fleet import Fleet
 
 from . import hall_rasters as rasters
-from .colour_scales import ColourScale, colours_of, labels
+from .colour_scales import ColourScale, annotation_context
+from .recording_racks import TRENDS, mark_entities
 from .recording_series import (
     COMMAND_STATES,
     FLEET_PLOTS,
@@ -127,7 +128,7 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
 
 
 def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
-    """Return the plots of a data center in three tabs: overview, cooling and work."""
+    """Return the plots of a data center in four tabs: overview, racks, cooling and work."""
 
     def plots(*entities: str) -> list[Any]:
         return [_series_view(tab, entity) for entity in entities]
@@ -135,12 +136,21 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
     actions = rrb.StateTimelineView(
         origin=f"{tab.path}/actions", name="actions", time_view=_whole_run()
     )
+    trends = [_plot_view(f"{tab.path}/racks/{entity}", title) for entity, title in TRENDS.items()]
+    hottest_row = rrb.Spatial2DView(
+        origin=f"{tab.path}/row", name="hottest row: inlets by time and rack"
+    )
     overview = rrb.Grid(
-        *plots("temperature_c", "power_kw", "carbon_intensity", QUEUE_ENTITY, "battery"),
+        *plots("temperature_c"),
+        trends[0],
+        *plots("power_kw"),
+        hottest_row,
+        *plots("carbon_intensity", QUEUE_ENTITY, "battery"),
         actions,
         grid_columns=2,
         name="overview",
     )
+    racks = rrb.Grid(*trends, hottest_row, grid_columns=2, name="racks")
     cooling = rrb.Grid(
         *plots("hvac_kw", "pue"),
         _plot_view(f"{tab.path}/crac/temperature_c", "CRAC supply and return air [C]"),
@@ -157,7 +167,7 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
         grid_columns=2,
         name="work",
     )
-    return rrb.Tabs(overview, cooling, work, active_tab=0)
+    return rrb.Tabs(overview, racks, cooling, work, active_tab=0)
 
 
 def _series_view(tab: FocusTab, entity: str) -> Any:
@@ -181,11 +191,14 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
         visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
     )
     height, width = tab.image_shape
-    edge = 0.04 * max(height, width)
+    edge = 0.06 * max(height, width)
     image = rrb.Spatial2DView(
         origin=f"{tab.path}/map/{quantity}",
         # A pointer on the map names the rack, from the map of names behind it.
-        contents=["$origin/**", f"+ {tab.path}/map/racks"],
+        contents=[
+            "$origin/**",
+            *(f"+ {tab.path}/map/{mark}" for mark in ("racks", "crac", "down", "hottest")),
+        ],
         name=f"{MAP_TITLES[quantity]} [{scale.unit}]",
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-edge, width + edge), y_range=(-edge, height + edge)
@@ -286,6 +299,8 @@ def data_center_entities(
         shown = rr.StateConfiguration(values=states, labels=states, colors=state_colours)
         yield f"{path}/actions/{entity}", shown
     yield from _map_entities(fleet.configs[dc].hall, path, scales)
+    hall = fleet.configs[dc].hall
+    yield from mark_entities(f"{path}/map", hall, units, rasters.tile_grid(hall))
     yield from _hall_entities(fleet, dc, f"{path}/hall", levels, units)
 
 
@@ -303,7 +318,7 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
         image_format = rr.components.ImageFormat(
             width=width, height=height, color_model="L", channel_datatype="U8"
         )
-        yield f"{path}/map/{quantity}", _classes(scale)
+        yield f"{path}/map/{quantity}", annotation_context(scale)
         image = rr.SegmentationImage.from_fields(format=image_format, opacity=1.0)
         yield f"{path}/map/{quantity}", image
         yield from _colour_bar(f"{path}/legend/{quantity}", scale)
@@ -318,10 +333,8 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
     # Names are drawn in no colour behind the maps, only for the pointer.
     invisible = [rr.AnnotationInfo(i, name, (0, 0, 0, 0)) for i, name in enumerate(names, 1)]
     yield f"{path}/map/racks", rr.AnnotationContext(invisible)
-    yield (
-        f"{path}/map/racks",
-        rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0),
-    )
+    numbers = rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0)
+    yield f"{path}/map/racks", numbers
 
 
 def _hall_entities(
@@ -397,16 +410,6 @@ def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
     return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
-def _classes(scale: ColourScale) -> rr.AnnotationContext:
-    """Return Rerun's description of the colours and names of the classes of a scale."""
-    colours, names = colours_of(scale)[1:].tolist(), labels(scale)
-    # Class 0, of gaps and of missing values, has no colour.
-    infos = [rr.AnnotationInfo(0, "no rack", (0, 0, 0, 0))]
-    for index, (name, colour) in enumerate(zip(names, colours, strict=True), 1):
-        infos.append(rr.AnnotationInfo(index, name, colour))
-    return rr.AnnotationContext(infos)
-
-
 def _colour_bar(path: str, scale: ColourScale) -> Entities:
     """Yield the entities of a colour bar: a gradient, and points labelled with values.
 
@@ -418,7 +421,7 @@ def _colour_bar(path: str, scale: ColourScale) -> Entities:
     """
     gradient, ticks = rasters.colour_bar(scale)
     height, width = gradient.shape
-    yield f"{path}/bar", _classes(scale)
+    yield f"{path}/bar", annotation_context(scale)
     yield f"{path}/bar", rr.SegmentationImage(gradient, opacity=1.0)
 
     def points(values: Sequence[float], texts: Sequence[str], y: float) -> rr.Points2D:

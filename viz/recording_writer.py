@@ -3,6 +3,8 @@
 A recording has these entities, where NAME is the name of a data center in focus:
 
     dc/NAME/map/{inlet,outlet,...}     heat maps, a tile per rack
+    dc/NAME/map/{hottest,down,crac}    marks on the maps: hottest rack, CRAC units
+    dc/NAME/racks/..., row/...         trends of racks, and the hottest row by time
     dc/NAME/hall/{inlet,outlet}        3D hall, a voxel per rack and level
     dc/NAME/series/..., crac/...       series, each entity with lines of one unit
     dc/NAME/actions/...                commands, as states
@@ -27,15 +29,25 @@ import numpy.typing as npt
 import rerun as rr
 
 from sdc_taichi.exogenous.year_clock import step_times
-from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c
+from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c, rank
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import colour_scales
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, InletRange
+from .rack_histories import RackHistory
 from .recording_blocks import Block, BlockBuilder, choose_cadence
 from .recording_output import RecordingOutput
+from .recording_racks import (
+    TRENDS,
+    HottestRow,
+    check_selection,
+    down_columns,
+    mark_columns,
+    trend_lines,
+    unit_pixels,
+)
 from .recording_series import (
     COMMAND_STATES,
     FIELD_ROWS,
@@ -55,10 +67,13 @@ from .recording_views import (
 )
 
 if TYPE_CHECKING:
+    from sdc_taichi.hall.rack_selection import RackSelection
     from sdc_taichi.sim.simulator import Simulator
 
 LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
 """Longest time between two blocks, in s of real time: of a live recording, and of a file."""
+MOMENT_ENTITY = "moment"
+"""Entity with the time that a viewer shows first, as text."""
 _MEANS_OF_MAPS = {"inlet": "inlet_mean_c", "outlet": "outlet_mean_c", "rise": "inlet_mean_c"}
 _NO_COMMAND = 2
 """Placeholder for the sign of a command before the first step; differs from -1, 0 and 1."""
@@ -76,6 +91,10 @@ class RecordingWriter:
         every_steps: interval of heat maps and of frames of the 3D hall, in steps; None derives it
             from the number of racks in focus.
         inlet_range: range of the colours of inlets, see ``colour_scales.inlet_scale``.
+        racks: racks whose trends are recorded; None records the default ones.
+
+    Raises:
+        ConfigError: a hall does not have the racks, or they are too many.
     """
 
     def __init__(
@@ -87,8 +106,16 @@ class RecordingWriter:
         output: RecordingOutput,
         every_steps: int | None,
         inlet_range: InletRange = None,
+        racks: RackSelection | None = None,
     ) -> None:
         fleet = sim.fleet
+        self._selections = [
+            check_selection(racks, fleet.configs[dc].hall, names[dc]) for dc in focus
+        ]
+        self._histories = [RackHistory(fleet, dc) for dc in focus]
+        self._map_steps: list[int] = []
+        self._hottest_c: list[F64] = []
+        """Hottest inlet of each data center in focus, in C, (T, n) of each block."""
         self._fleet, self._description, self._output = fleet, description, output
         self._names, self._focus = names, focus
         self._start = sim.drivers.start[focus]
@@ -101,6 +128,11 @@ class RecordingWriter:
         self._inlet_range = inlet_range
         self._scales: list[dict[str, ColourScale]] = []
         self._tile_grids = [rasters.tile_grid(fleet.configs[dc].hall) for dc in focus]
+        units = np.diff(fleet.unit_offsets)
+        self._unit_pixels = [
+            unit_pixels(fleet.configs[dc].hall, int(units[dc]), grid)
+            for dc, grid in zip(focus, self._tile_grids, strict=True)
+        ]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
@@ -127,20 +159,25 @@ class RecordingWriter:
         if self.failed:
             return
         self._builder.add(result, rewards)
+        for history in self._histories:
+            history.add(result)
         self.steps_added += 1
         is_late = time.monotonic() - self._written_at_s > self._block_s
         if is_late or self._builder.is_full:
             self._write_block()
 
     def flush(self) -> None:
-        """Write the steps of the current, incomplete block."""
+        """Write the steps of the current, incomplete block, and what is known of their racks."""
         if self._builder.steps and not self.failed:
             self._write_block()
+            self._write_racks()
 
     def close(self) -> None:
         """Write the remaining steps, and the index of the file."""
-        self.flush()
-        self._output.close()
+        try:
+            self.flush()
+        finally:
+            self._output.close()
 
     def _write_block(self) -> None:
         """Write the current block, and begin a new one."""
@@ -163,7 +200,56 @@ class RecordingWriter:
             self._write_states(index, path, block.steps, values)
             self._write_log(index, path, [e for e in block.entries if e.dc == dc])
             self._write_frames(block, index, path, map_times[index], hall_times[index])
+            self._write_down(index, path, [(at, units) for at, of, units in block.down if of == dc])
+        self._map_steps += block.map_steps.tolist()
+        self._hottest_c.append(block.values[:, FIELD_ROWS["inlet_max_c"]])
         self._output.send_block()
+
+    def _write_racks(self) -> None:
+        """Write the trends of racks and the hottest row of each hall, and the moment to show."""
+        if not self._output.is_open:
+            return
+        for index, (dc, history) in enumerate(zip(self._focus, self._histories, strict=True)):
+            hall, path = self._fleet.configs[dc].hall, self._path(dc)
+            peak_c = history.peak_inlet_c()
+            racks = self._selections[index].racks(hall, peak_c)
+            values = history.of_racks(racks)
+            times = self._times(values.steps)[index]
+            lines = trend_lines(racks.tolist(), peak_c, hall.racks_per_row)
+            for entity in TRENDS:
+                self._output.send_static(f"{path}/racks/{entity}", lines)
+                self._write_scalars(f"{path}/racks/{entity}", times, getattr(values, entity))
+            row = HottestRow(f"{path}/row", history, hall, self._scales[index]["inlet"])
+            for name, component in row.entities(self._clock_texts(values.steps, index)):
+                self._output.send_static(name, component)
+            if self._map_steps:
+                steps = np.array(self._map_steps)
+                cursor = row.cursor_columns(steps)
+                self._output.add_columns(f"{path}/row/cursor", self._times(steps)[index], cursor)
+        self._write_moment()
+        self._output.send_block()
+
+    def _write_moment(self) -> None:
+        """Write the time that a viewer shows first, and log the hottest inlet of each hall."""
+        hottest_c = rank(np.concatenate(self._hottest_c))
+        first = self.steps_added - len(hottest_c)
+        begin, end = 0, len(hottest_c)
+        event = self._builder.first_event
+        if event is not None:
+            begin, end = max(0, event.start_step - first), min(end, event.end_step - first)
+        step = first + begin + int(hottest_c[begin:end].max(axis=1).argmax())
+        moment = str(self._clock(np.array([step]))[0, 0].astype("datetime64[s]"))
+        self._output.send_static(MOMENT_ENTITY, rr.TextDocument(moment))
+
+    def _write_down(
+        self, index: int, path: str, changes: list[tuple[int, tuple[int, ...]]]
+    ) -> None:
+        """Write the marks of the CRAC units of a data center that are down, where they change."""
+        if not changes:
+            return
+        steps = np.array([step for step, _ in changes])
+        columns = down_columns([units for _, units in changes], self._unit_pixels[index])
+        self._output.add_columns(f"{path}/map/down", self._times(steps)[index], columns)
 
     def _open(self) -> None:
         """Open the output and send the static entities."""
@@ -287,9 +373,9 @@ class RecordingWriter:
         steps = np.array([entry.step for entry in entries])
         # The text includes day and time of day, because the time column of the viewer is too narrow
         # to show both.
-        clock = np.datetime_as_string(self._clock(steps)[:, index], "m").tolist()
+        clock = self._clock_texts(steps, index)
         log = rr.TextLog.columns(
-            text=[f"{at[5:10]} {at[11:]} {e.text}" for at, e in zip(clock, entries, strict=True)],
+            text=[f"{at} {entry.text}" for at, entry in zip(clock, entries, strict=True)],
             level=[entry.level for entry in entries],
         )
         self._output.add_columns(f"{path}/events", self._times(steps)[index], log)
@@ -318,6 +404,10 @@ class RecordingWriter:
             frames = rasters.heat_maps(classes, grid)
             columns = rr.SegmentationImage.columns(buffer=frames.reshape(len(frames), -1))
             self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
+        if len(block.map_steps):
+            hall = self._fleet.configs[self._focus[index]].hall
+            mark = mark_columns(block.maps["inlet"][:, racks], hall, grid)
+            self._output.add_columns(f"{path}/map/hottest", map_times, mark)
         for quantity, values in block.halls.items():
             colours = colour_scales.colours_of(scales[quantity])
             voxels = colours[colour_scales.classes_of(values[:, levels], scales[quantity])]
@@ -331,6 +421,11 @@ class RecordingWriter:
         Their shape is (T, n).
         """
         return step_times(self._start, steps, self._fleet.steps_per_hour)
+
+    def _clock_texts(self, steps: I64, index: int) -> list[str]:
+        """Return the times at which steps begin in a data center in focus, as ``MM-DD hh:mm``."""
+        clock = np.datetime_as_string(self._clock(steps)[:, index], "m").tolist()
+        return [f"{at[5:10]} {at[11:]}" for at in clock]
 
     def _times(self, steps: I64) -> list[list[rr.TimeColumn]]:
         """Return the time columns of both timelines, for each data center in focus."""

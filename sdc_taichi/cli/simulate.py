@@ -63,6 +63,14 @@ class RecordingOptions:
         int | None,
         typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
     ] = None
+    racks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RACK|row:ROW|hottest:COUNT|...",
+            help="Racks whose trends are recorded, separated by commas: numbers, ROW:PLACE, "
+            "row:ROW, zone:ZONE, hottest:COUNT, median. [default: hottest:10,median]",
+        ),
+    ] = None
     inlet_range: Annotated[
         str | None,
         typer.Option(
@@ -98,6 +106,7 @@ class RecordingOptions:
             only_recorded = {
                 "--focus": self.focus,
                 "--every": self.every,
+                "--racks": self.racks,
                 "--inlet-range": self.inlet_range,
             }
             for name, value in only_recorded.items():
@@ -106,6 +115,7 @@ class RecordingOptions:
                         f"{name}: given without a recording; valid with --record, --serve"
                     )
             return None
+        from sdc_taichi.hall.rack_selection import parse_racks
         from sdc_taichi.viz.colour_scales import parse_inlet_range
         from sdc_taichi.viz.recorder import Recorder
 
@@ -116,7 +126,12 @@ class RecordingOptions:
         names = None if self.focus is None else [name.strip() for name in self.focus.split(",")]
         inlet_range = None if self.inlet_range is None else parse_inlet_range(self.inlet_range)
         return Recorder(
-            target, focus=names, every=self.every, serve_port=port, inlet_range=inlet_range
+            target,
+            focus=names,
+            every=self.every,
+            serve_port=port,
+            inlet_range=inlet_range,
+            racks=None if self.racks is None else parse_racks(self.racks),
         )
 
 

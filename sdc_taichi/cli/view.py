@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import threading
+import time
+import warnings
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
+import numpy as np
 import typer
 
 from sdc_taichi.cli.options import check_out_file, force_option, out_option
@@ -19,6 +23,7 @@ WEB_PORT = 9090
 """Preferred port of the page that ``--web`` serves; if it is in use, another port is taken."""
 _RECORDING_MAGIC = b"RRF"
 _STOP_WAIT_S = 5.0
+_LOADING_WAIT_S = 120.0
 
 
 def report_command(
@@ -82,7 +87,8 @@ def view_command(
 ) -> None:
     """Show a recording in Rerun's viewer, or serve it on 127.0.0.1 to a browser.
 
-    Ends with the viewer, or on Ctrl-C.
+    The viewer begins at the hottest moment of the run, or of its first event. Ends with the viewer,
+    or on Ctrl-C.
     """
     from sdc_taichi.viz.recording_output import check_address, is_address, listens
 
@@ -92,11 +98,18 @@ def view_command(
         check_address(recording)
         if not listens(recording):
             raise SdcError(f"{recording}: nothing listens there; valid is the address of a run")
+        moment = None
     else:
         check_recording(Path(recording))
+        moment = moment_of(Path(recording))
     command, page = viewer_command(recording, web=web, port=port)
     if page is not None:
         typer.echo(f"Viewer: {page} (Ctrl-C ends it)")
+        if moment is not None:
+            typer.echo(f"Hottest, or in its first event: {moment.replace('T', ' ')}")
+    elif moment is not None:
+        port_of_viewer = int(command[command.index("--port") + 1])
+        threading.Thread(target=show_moment, args=(port_of_viewer, moment), daemon=True).start()
     code = _run_viewer(command)
     if code:
         hint = "" if web else "; without a screen, serve it to a browser with --web"
@@ -113,6 +126,53 @@ def check_recording(path: Path) -> None:
         beginning = file.read(len(_RECORDING_MAGIC))
     if beginning != _RECORDING_MAGIC:
         raise SdcError(f"{path}: no Rerun recording; valid is a file of simulate --record")
+
+
+def moment_of(path: Path) -> str | None:
+    """Return the time of a recording that a viewer shows first, in ISO format; None without one.
+
+    A recording of a run that was killed has none, nor has a file that this version cannot read.
+    """
+    from sdc_taichi.viz.recording_output import import_rerun
+
+    import_rerun()
+    from rerun.chunk import RrdReader
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of recordings that were cut short
+            chunks = RrdReader(path).stream().filter(content="/moment").to_chunks()
+        texts = [chunk.to_record_batch().to_pydict()["TextDocument:text"] for chunk in chunks]
+        return str(np.datetime64(texts[-1][-1][0])) if texts else None
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError):
+        return None
+
+
+def show_moment(port: int, moment: str) -> None:
+    """Move the viewer of a port to a time once it has loaded its recording, and pause it there.
+
+    A viewer that cannot be controlled stays at the beginning.
+
+    Args:
+        port: port on which the viewer listens.
+        moment: the time, in ISO format.
+    """
+    from rerun.experimental import ViewerClient
+
+    from sdc_taichi.viz.recording_output import served_at
+
+    deadline = time.monotonic() + _LOADING_WAIT_S
+    while time.monotonic() < deadline:
+        time.sleep(0.2)
+        try:
+            viewer = ViewerClient.connect(served_at(port))
+            state = viewer.get_state()
+            if state.active_recording and not state.loading:
+                timestamp = np.datetime64(moment, "ns")
+                viewer.set_time("sim_time", timestamp=timestamp, play_state="paused")
+                return
+        except Exception:  # of any kind, while the viewer starts or after it has been closed
+            continue
 
 
 def viewer_command(recording: str, *, web: bool, port: int | None) -> tuple[list[str], str | None]:
