@@ -19,6 +19,8 @@ previous sweep. Each line names its function on the right:
         T_sup,k  <- setpoint, warmer for coils at their limit and return control  set_supply
     V_crac <- sum_k V_k
     T_ret  <- (sum_j V_j T_out,j - sum_j r'_j V_j T_mix,j + V_bypass T_sup) / V_crac
+    for each CRAC unit k that draws its own return air:                     draw_own_return
+        T_ret,k  <- T_ret + offset, the same sum weighted by q_jk / V_k
     T_mix,j  <- sum_i w_ji T_out,i                                          mixes.py
 
 In steady air, sweeps repeat until another sweep would change no mix by more than ``tolerance_k``,
@@ -79,6 +81,7 @@ from .sums import (
 from .units import (
     blow_out_casings,
     change_of_air,
+    draw_own_return,
     extrapolate_units,
     follow_hottest_inlet,
     keep_supply,
@@ -264,6 +267,15 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     air.supply_c = units.supply_m3k_s / units.flow_m3s
     air.units_return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
     dc.return_c = air.units_return_c
+    if ti.static(hall.own_return):
+        # Return air acts on units that are down, on coils at their limit and on return-air control.
+        # Otherwise only the state at the end of a transient step needs it.
+        is_due = dc.adjusts_supply > 0.0
+        if ti.static(hall.transient):
+            is_due = is_due or is_last
+        if dc.own_return > 0.0 and is_due:
+            is_first = sweep == 0 or dc.adjusts_supply == 0.0
+            draw_own_return(hall, n, air.units_return_c, is_first)
     dc.crac_m3s_per_rack = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
     # Each mix moves by the midpoint of the exhausts' changes, plus or minus half their spread.

@@ -174,6 +174,7 @@ DC_DOUBLES = {
     "weighs": "1 if the weight of a unit differs from 1 in the next sweep",
     "weighs_used": "value of weighs in the last sweep",
     "oversupply": "decay of the exhaust shares per excess of supply over need",
+    "own_return": "1 if each unit draws its own return air, 0 if all draw that of the hall",
     "exceeds": "1 if a unit delivers more than its racks need, and thus lowers exhaust shares",
     "exceeds_used": "value of exceeds in the last sweep",
     "shift_k": "common shift of the mixes since the last exchange, K (sparse or transient)",
@@ -211,7 +212,7 @@ UNIT_STATE = {
     "last_f_change": "change of fresh_ratio in the sweep before (steady air)",
     "last_supply_change_k": "change of supply air in the sweep before, K (steady air)",
     "plain_m3s": "supply air that the racks demand at the exhaust shares of the design point, m3/s",
-    "taken_m3s": "supply air that racks take from the unit in a pass over weights, m3/s; then the "
+    "taken_m3s": "air that racks exchange with the unit in a pass over weights, m3/s; then the "
     "weight of the next pass",
     "supply_ratio": "supply air that reaches the racks / their need at design exhaust shares",
     "supply_ratio_used": "supply_ratio with which the last sweep computed the racks",
@@ -220,6 +221,10 @@ UNIT_STATE = {
     "fitted_m3s": "airflow to which weight was fitted, m3/s; -1 for none",
     "strength": "weight to the power of the coupling",
     "strength_used": "strength with which the last sweep computed the racks",
+    "drawn_m3s": "air of the racks that the unit draws, m3/s (own return air)",
+    "return_weight": "weight of the unit in the returns of all racks (own return air)",
+    "return_offset_k": "return air of the unit minus that of the hall, K",
+    "base_k": "supply air without a limit of the coil minus setpoint, K (own return air)",
 }
 RACK_STATE = {
     "mixed_c": "exhaust mix before the rack; transient: room air at its intake, C",
@@ -292,6 +297,11 @@ PLENUM_NEED = {
     "present_m3s": "supply air that the rack needs in the present sweep, m3/s",
 }
 """Need of each rack for supply air, to which weights of coupled units are fitted."""
+RETURN_AIR = {
+    "flow_m3s": "exhaust minus recirculated intake, which returns to the units, m3/s",
+    "flow_m3k_s": "airflow times temperature of this air, m3 K/s",
+}
+"""Air of each rack that returns to the units in the present sweep."""
 DC_OUT = {
     "cpu_w": "power without fans, W",
     "it_fan_w": "power of the server fans, W",
@@ -332,6 +342,7 @@ ARGUMENTS = {
     # How the kernel runs.
     "recirculates": Argument("template"),  # True if racks take in exhaust air
     "transient": Argument("template"),  # True if each sweep is a substep
+    "own_return": Argument("template"),  # True if units of a data center draw their own return air
     "serial": Argument("template"),  # True: run on the calling thread alone
     "slices": Argument("i32"),  # number of parts, one thread each
     "one": Argument("i32"),  # always 1, see "Loops of step 1" in README.md
@@ -381,7 +392,9 @@ ARGUMENTS = {
     "unit_plain_m3s": _numbers("f64", 1),  # the same at the exhaust shares of the design point
     "plenum_shares": _lanes("f64", 1),  # unit_shares in f64, of halls whose units are coupled
     "plenum_need": _lanes("f64", 2, PLENUM_NEED, "plenum"),
-    "unit_lanes": _lanes("f64", 1),  # air that racks take from each unit, by lane
+    "return_shares": _lanes("f64", 1),  # share of each unit in a rack's returns, q of docs/hall.md
+    "return_air": _lanes("f64", 2, RETURN_AIR, "returns"),
+    "unit_lanes": _lanes("f64", 1),  # air that racks exchange with each unit, by lane
     "chunk_sums": _numbers("f64", 1, SUMS, "chunks"),
     "group_values": _vectors(2, GROUP_OUT, "values"),
     # Results.
@@ -406,6 +419,7 @@ _STEP_ALONE = (
     *("sample_outlet_c", "mode_amounts", "mode_amount"),
     *("dc_control", "rack_state_by_4", "rack_state_by_16", "server_c_before", "server_c_after"),
     *("scratch", "unit_need_m3s", "unit_plain_m3s", "plenum_shares", "plenum_need", "unit_lanes"),
+    *("own_return", "return_shares", "return_air"),
     *("chunk_sums", "dc_out"),
 )
 STEP_ARGUMENTS = {name: ARGUMENTS[name] for name in ARGUMENTS if name not in _LAYERS_ALONE}

@@ -120,6 +120,8 @@ def compute_block(
         # This is `x = x + y`, because `x += y` would be an atomic operation.
         terms.return_m3k_s = terms.return_m3k_s + return_m3k_s
         block.captured_m3s = captured_m3s
+        if ti.static(hall.own_return):
+            store_return(hall, n, block_at, air.cover * fresh_m3s, return_m3k_s)
         store_need(hall, n, block_at, block_terms_at, racks, air, sums, fresh_m3s)
         exhaust_c = outlet_c
         if ti.static(hall.transient):
@@ -178,6 +180,20 @@ def store_need(
         for i in range(LANES):
             need_m3s[i] = ti.cast(plain_m3s[i], ti.f64)
         hall.plenum[block_at].present_m3s = need_m3s
+
+
+@ti.func
+@no_type_check
+def store_return(hall: ti.template(), n, block_at, flow_m3s, flow_m3k_s):
+    """Store the air of the racks of a block that returns to the units, for ``draw_own_return``."""
+    if hall.dcs[n].own_return > 0.0:
+        flow_in_f64 = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+        heat_in_f64 = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+        for i in range(LANES):
+            flow_in_f64[i] = ti.cast(flow_m3s[i], ti.f64)
+            heat_in_f64[i] = ti.cast(flow_m3k_s[i], ti.f64)
+        hall.returns[block_at].flow_m3s = flow_in_f64
+        hall.returns[block_at].flow_m3k_s = heat_in_f64
 
 
 @ti.func

@@ -30,6 +30,8 @@ WEIGHT_WITHIN, LEAST_WEIGHT = 1e-9, 1e-12
 MOST_WEIGHT_PASSES, WEIGHT_PRODUCTS, LEAST_WEIGHT_PASSES = 300, 2e8, 20
 """Maximum number of passes over the weights of a data center; if these are more than so many
 products of share and weight, the number of passes for it, but at least the last number."""
+SUPPLY, RETURN, RETURN_HEAT = range(3)
+"""Air that racks exchange with the units: supply air, return air, or the heat of return air."""
 LEAST_NEED_M3S = 1e-6
 """Need of all racks of a data center below which units have no weights, in m3/s."""
 WEIGHTS_EXTRAPOLATED_EVERY = 4
@@ -87,8 +89,32 @@ def unit_need(hall: ti.template(), n, unit):
 
 @ti.func
 @no_type_check
-def take_from_units(hall: ti.template(), n, of_design):
-    """Add up, lane by lane, what racks take from each unit per weight of the unit, in m3/s."""
+def unit_weight(hall: ti.template(), at, air: ti.template()):
+    """Return the weight of a unit in the supply of the racks, or in their returns."""
+    weight = hall.units[at].weight
+    if ti.static(air != SUPPLY):
+        weight = hall.units[at].return_weight
+    return weight
+
+
+@ti.func
+@no_type_check
+def set_unit_weight(hall: ti.template(), at, air: ti.template(), weight):
+    """Set the weight of a unit in the supply of the racks, or in their returns."""
+    if ti.static(air != SUPPLY):
+        hall.units[at].return_weight = weight
+    else:
+        hall.units[at].weight = weight
+
+
+@ti.func
+@no_type_check
+def take_from_units(hall: ti.template(), n, of_design, air: ti.template()):
+    """Add up, lane by lane, what racks take from each unit per weight of the unit, in m3/s.
+
+    ``air``: SUPPLY, or RETURN for what racks return to each unit, or RETURN_HEAT for the same times
+    its temperature above the return air of the hall, in m3 K/s.
+    """
     dc, unit = hall.dcs[n], 0
     none = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
@@ -99,16 +125,23 @@ def take_from_units(hall: ti.template(), n, of_design):
     while block_at < hall.chunks[hall.dcs[n + 1].first_chunk].first_block:
         share_0, total, unit = first_share_at(hall, n, block_at), none, 0
         while unit < n_units:
-            total += hall.plenum_shares[share_0 + unit] * hall.units[dc.first_unit + unit].weight
+            weight = unit_weight(hall, dc.first_unit + unit, air)
+            total += share_of_unit(hall, share_0 + unit, air) * weight
             unit += hall.one
-        need_m3s = hall.plenum[block_at].present_m3s
-        if of_design:
-            need_m3s = hall.plenum[block_at].design_m3s
-        per_total = need_m3s / larger(total, none + ti.cast(1e-30, ti.f64))
+        flow_m3s = none
+        if ti.static(air == SUPPLY):
+            flow_m3s = hall.plenum[block_at].present_m3s
+            if of_design:
+                flow_m3s = hall.plenum[block_at].design_m3s
+        else:
+            flow_m3s = hall.returns[block_at].flow_m3s
+        if ti.static(air == RETURN_HEAT):
+            flow_m3s = hall.returns[block_at].flow_m3k_s - flow_m3s * dc.return_c
+        per_total = flow_m3s / larger(total, none + ti.cast(1e-30, ti.f64))
         unit = 0
         while unit < n_units:
             at = dc.first_unit + unit
-            taken_m3s = hall.plenum_shares[share_0 + unit] * per_total
+            taken_m3s = share_of_unit(hall, share_0 + unit, air) * per_total
             hall.unit_lanes[at] = hall.unit_lanes[at] + taken_m3s
             unit += hall.one
         block_at += hall.one
@@ -116,8 +149,20 @@ def take_from_units(hall: ti.template(), n, of_design):
 
 @ti.func
 @no_type_check
-def fit_weights(hall: ti.template(), n, of_design, need_m3s):
-    """Fit the weights of units that share a plenum to what they deliver.
+def share_of_unit(hall: ti.template(), share_at, air: ti.template()):
+    """Return the shares of a unit in the supply of the racks of a block, or in their returns."""
+    share = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+    if ti.static(air != SUPPLY):
+        share = hall.return_shares[share_at]
+    else:
+        share = hall.plenum_shares[share_at]
+    return share
+
+
+@ti.func
+@no_type_check
+def fit_weights(hall: ti.template(), n, of_design, need_m3s, air: ti.template()):
+    """Fit the weights of units that share a plenum to what they deliver, or to what they draw.
 
     Each pass multiplies the weight of a unit by what it delivers divided by what racks take from it
     (Deming and Stephan 1940, see ``sdc_taichi.hall.unit_supply``). Where speeds are given, only the
@@ -129,23 +174,30 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
         n: index of the data center.
         of_design: True to fit to the need of the racks at the design point.
         need_m3s: need of all racks to which that need is scaled, in m3/s; 0 does not scale it.
+        air: SUPPLY, or RETURN to fit the weights in the returns of the racks to the airflow that
+            each unit draws from them.
     """
     dc, end_unit = hall.dcs[n], hall.dcs[n + 1].first_unit
     follows, fresh_share = dc.follows_need > 0.0, ti.cast(dc.fresh_share, ti.f64)
+    if ti.static(air != SUPPLY):
+        follows = False
     products = ti.cast(dc.racks, ti.f64) * ti.cast(end_unit - dc.first_unit, ti.f64)
     most_passes = ti.max(WEIGHT_PRODUCTS / products, ti.cast(LEAST_WEIGHT_PASSES, ti.f64))
     most_passes = ti.min(most_passes, ti.cast(MOST_WEIGHT_PASSES, ti.f64))
     passes, change = ti.cast(0.0, ti.f64), ti.cast(1.0, ti.f64)
     while passes < most_passes and change > WEIGHT_WITHIN:
-        take_from_units(hall, n, of_design)
+        take_from_units(hall, n, of_design, air)
         total, flow_m3s = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         at = dc.first_unit
         while at < end_unit:
             unit = hall.units[at]
-            taken_m3s = unit.weight * sum_lanes(hall.unit_lanes[at])
+            taken_m3s = unit_weight(hall, at, air) * sum_lanes(hall.unit_lanes[at])
             unit.taken_m3s = taken_m3s
             total += taken_m3s
-            flow_m3s += ti.cast(unit.design_m3s, ti.f64) * unit.speed
+            if ti.static(air != SUPPLY):
+                flow_m3s += unit.drawn_m3s
+            else:
+                flow_m3s += ti.cast(unit.design_m3s, ti.f64) * unit.speed
             at += hall.one
         scale = ti.cast(1.0, ti.f64)
         if not follows:
@@ -158,11 +210,14 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
             unit = hall.units[at]
             design_m3s = ti.cast(unit.design_m3s, ti.f64)
             low_m3s = design_m3s * unit.speed
+            if ti.static(air != SUPPLY):
+                low_m3s = unit.drawn_m3s
             high_m3s = low_m3s
             if follows:
                 low_m3s = fresh_share * design_m3s * ti.cast(unit.low, ti.f64)
                 high_m3s = fresh_share * design_m3s * ti.cast(unit.high, ti.f64)
-            per_m3s = unit.weight / ti.max(scale * unit.taken_m3s, 1e-30)
+            before = unit_weight(hall, at, air)
+            per_m3s = before / ti.max(scale * unit.taken_m3s, 1e-30)
             weight = ti.min(ti.max(low_m3s * per_m3s, 1.0), high_m3s * per_m3s)
             if total < LEAST_NEED_M3S:
                 weight = ti.cast(1.0, ti.f64)
@@ -180,12 +235,12 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
         while at < end_unit:
             unit = hall.units[at]
             weight = ti.min(ti.max(norm * unit.taken_m3s, LEAST_WEIGHT), 1.0 / LEAST_WEIGHT)
-            weight_change = weight / unit.weight - 1.0
+            weight_change = weight / unit_weight(hall, at, air) - 1.0
             change = ti.max(change, ti.abs(weight_change))
             product += weight_change * unit.last_weight_change
             square += unit.last_weight_change * unit.last_weight_change
             unit.last_weight_change = weight_change
-            unit.weight = weight
+            set_unit_weight(hall, at, air, weight)
             at += hall.one
         passes += 1.0
         is_due = ti.cast(passes, ti.i32) % WEIGHTS_EXTRAPOLATED_EVERY == 0
@@ -195,7 +250,8 @@ def fit_weights(hall: ti.template(), n, of_design, need_m3s):
             while at < end_unit:
                 unit = hall.units[at]
                 further = ti.pow(1.0 + unit.last_weight_change, share)
-                unit.weight = unit.weight * ti.min(ti.max(further, 0.3), 3.0)
+                weight = unit_weight(hall, at, air) * ti.min(ti.max(further, 0.3), 3.0)
+                set_unit_weight(hall, at, air, weight)
                 at += hall.one
 
 
@@ -243,7 +299,7 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
         of_design = not follows
         if ti.static(begins):
             of_design = True
-        fit_weights(hall, n, of_design, need_m3s)
+        fit_weights(hall, n, of_design, need_m3s, SUPPLY)
     change, weighs = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     at = dc.first_unit
     while at < end_unit:
@@ -256,6 +312,48 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
         at += hall.one
     dc.weighs = weighs
     return change
+
+
+@ti.func
+@no_type_check
+def draw_own_return(hall: ti.template(), n, return_c, is_first):
+    """Set the return air of each unit of a data center, as a difference from that of the hall.
+
+    V_k T_ret,k = sum_j q_jk (V_j T_out,j - r'_j V_j T_mix,j) + V_bypass,k T_sup,k. The shares q_jk
+    fall with the distance from the exhaust face of rack j to unit k; their weights are fitted to
+    the air that each rack returns now and each unit draws now. The air that passes the racks
+    returns to its own unit. Temperatures are differences from ``return_c``, so that
+    sum_k V_k T_ret,k is exact.
+    """
+    dc, end_unit = hall.dcs[n], hall.dcs[n + 1].first_unit
+    drawn_m3s, at = ti.cast(0.0, ti.f64), dc.first_unit
+    while at < end_unit:
+        unit = hall.units[at]
+        if is_first:
+            unit.return_weight = 1.0
+        unit.last_weight_change = 0.0
+        drawn_m3s += unit.drawn_m3s
+        at += hall.one
+    if drawn_m3s >= LEAST_NEED_M3S:
+        fit_weights(hall, n, False, 0.0, RETURN)
+    take_from_units(hall, n, False, RETURN_HEAT)
+    flow_m3s, mean_k = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    at = dc.first_unit
+    while at < end_unit:
+        unit = hall.units[at]
+        unit_m3s = ti.cast(unit.design_m3s, ti.f64) * unit.speed
+        above_m3k_s = unit.return_weight * sum_lanes(hall.unit_lanes[at])
+        above_m3k_s += (unit_m3s - unit.drawn_m3s) * (unit.supply_c - return_c)
+        unit.return_offset_k = above_m3k_s / ti.max(unit_m3s, 1e-30)
+        flow_m3s += unit_m3s
+        mean_k += above_m3k_s
+        at += hall.one
+    mean_k /= ti.max(flow_m3s, 1e-30)
+    at = dc.first_unit
+    while at < end_unit:
+        unit = hall.units[at]
+        unit.return_offset_k = unit.return_offset_k - mean_k
+        at += hall.one
 
 
 @ti.func
@@ -340,6 +438,8 @@ def run_crac_units(hall: ti.template(), n, is_last):
         is_running = ti.cast(unit.running, ti.f64)
         f_used, supply_c = unit.fresh_ratio, unit.supply_c
         mean_supply_c = supply_c
+        if ti.static(hall.own_return):
+            unit.drawn_m3s = f_used * need
         following = plain / ti.max(fresh_share * design_m3s, 1e-30)
         if dc.inlet_target_c > 0.0:
             following = dc.fan_speed
@@ -438,7 +538,8 @@ def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
 
     Newton's method solves sum_k min(C_k, g_k (theta - b_k)) = load for theta. g_k is the heat
     capacity flow of unit k, and b_k its supply air without a limit. The sum is concave in theta, so
-    a step from below never overshoots. Each step saturates another coil or is the last.
+    a step from below never overshoots. Each step saturates another coil or is the last. Units that
+    draw their own return air receive theta plus their ``return_offset_k``.
     """
     dc = hall.dcs[n]
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
@@ -449,7 +550,11 @@ def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
         while at < hall.dcs[n + 1].first_unit:
             unit = hall.units[at]
             g = air * ti.cast(unit.design_m3s, ti.f64) * unit.speed * ti.cast(unit.running, ti.f64)
-            wanted_w = g * (theta - ti.cast(unit.setpoint_c, ti.f64) - base_k)
+            unit_return_c, unit_base_k = theta, base_k
+            if ti.static(hall.own_return):
+                unit_return_c = theta + unit.return_offset_k
+                unit_base_k = unit.base_k
+            wanted_w = g * (unit_return_c - ti.cast(unit.setpoint_c, ti.f64) - unit_base_k)
             most_w = coil_spare_w(hall, n, at, scale)
             # The first pass ignores the limits and finds the starting point.
             if passes > 0 and wanted_w > most_w:
@@ -477,9 +582,10 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
     air is warmer if the air warms less on its way:
     b_k = setpoint + gain max(0, rise at design - rise). A coil that would have to remove more than
     its capacity C_k supplies warmer air, theta - C_k / (rho cp V_k). A unit that is down supplies
-    theta, the return air. If the capacity of all coils together is too small, all fall short by the
-    same share, and the room stores the remaining heat. In transient halls, all this is the air
-    behind the coils; the casings follow, see ``blow_out_casings``.
+    theta, the return air. With own return air, theta and the rise are those of each unit. If the
+    capacity of all coils together is too small, all fall short by the same share, and the room
+    stores the remaining heat. In transient halls, all this is the air behind the coils; the casings
+    follow, see ``blow_out_casings``.
 
     Args:
         hall: arguments of the hall kernel.
@@ -497,6 +603,12 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
     while at < hall.dcs[n + 1].first_unit:
         unit = hall.units[at]
         capacity_w += ti.cast(unit.running, ti.f64) * ti.cast(unit.capacity_w, ti.f64)
+        if ti.static(hall.own_return):
+            unit.base_k = base_k
+            if dc.own_return > 0.0:
+                own_rise_k = return_c + unit.return_offset_k - unit.supply_c
+                missing_k = ti.max(dc.return_rise_k - own_rise_k, 0.0)
+                unit.base_k = warmed_k + dc.return_gain * missing_k
         at += hall.one
     scale = ti.max(wanted_w / ti.max(capacity_w, 1.0), 1.0)
     theta = return_c
@@ -506,20 +618,22 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
     most_change_k, at = ti.cast(0.0, ti.f64), dc.first_unit
     while at < hall.dcs[n + 1].first_unit:
         unit = hall.units[at]
-        setpoint_c = ti.cast(unit.setpoint_c, ti.f64)
-        supply_c = setpoint_c + base_k
+        setpoint_c, unit_base_k, unit_return_c = ti.cast(unit.setpoint_c, ti.f64), base_k, theta
+        if ti.static(hall.own_return):
+            unit_base_k, unit_return_c = unit.base_k, theta + unit.return_offset_k
+        supply_c = setpoint_c + unit_base_k
         if units.any_running > 0.0:
             if unit.running > hall.real(0.0):
                 g = air * ti.max(ti.cast(unit.design_m3s, ti.f64) * unit.speed, 1e-30)
-                supply_c = ti.max(supply_c, theta - coil_spare_w(hall, n, at, scale) / g)
+                supply_c = ti.max(supply_c, unit_return_c - coil_spare_w(hall, n, at, scale) / g)
             else:
-                supply_c = theta
+                supply_c = unit_return_c
         most_change_k = ti.max(most_change_k, ti.abs(supply_c - unit.supply_c))
         excess_k = supply_c - setpoint_c - warmed_k
         if ti.static(hall.transient):
             # A unit that is down would supply such air as soon as it runs again.
             if units.any_running > 0.0 and unit.running <= hall.real(0.0):
-                excess_k = base_k - warmed_k
+                excess_k = unit_base_k - warmed_k
             unit.coil_change_k = supply_c - unit.coil_c
             unit.coil_c = supply_c
         unit.excess_k = excess_k
@@ -577,6 +691,14 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
     load_w = air * (return_c * units.flow_m3s - units.supply_m3k_s) + fans_w - units.casings_w
     running_w = air * (return_c * units.running_m3s - units.running_m3k_s) + fans_w
     running_w -= units.running_casings_w
+    if ti.static(hall.own_return):
+        if dc.own_return > 0.0 and dc.adjusts_supply > 0.0:
+            at = dc.first_unit
+            while at < hall.dcs[n + 1].first_unit:
+                unit = hall.units[at]
+                flow_m3s = ti.cast(unit.design_m3s * unit.running, ti.f64) * unit.speed
+                running_w += air * flow_m3s * unit.return_offset_k
+                at += hall.one
     wanted_w = ti.max(running_w + units.any_running * dc.room_j / hall.substep_s, 0.0)
     plant_w = ti.min(wanted_w, dc.coil_limit_w)
     coil_w = plant_w

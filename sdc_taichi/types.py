@@ -185,7 +185,7 @@ class State:
     """Temperature of the air in the casing of each CRAC unit, in C, (U,); only in transient
     halls."""
     return_air_c: F64
-    """Temperature of the return air of the CRAC units, in C, (B,); only in transient halls."""
+    """Temperature of the return air of each CRAC unit, in C, (U,); only in transient halls."""
     water_heat_j: F64
     """Heat stored in the chilled water, with that of a mixed tank, relative to the water at its
     setpoint, in J, (B,); only in transient halls."""

@@ -10,6 +10,8 @@ import pytest
 
 from sdc_taichi import Actions, ConfigError, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
+from sdc_taichi.kernels.arguments import row_index
+from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.sim.inlet_parts import Inlets
@@ -39,7 +41,12 @@ def coupled(coupling: float, oversupply: float = 0.0) -> tuple[str, str]:
 
 
 def solved(
-    layout: str, speed: Any, *overrides: str, load: float = 0.6
+    layout: str,
+    speed: Any,
+    *overrides: str,
+    load: float = 0.6,
+    rack_load: F64 | None = None,
+    running: F64 | None = None,
 ) -> tuple[Fleet, Hall, HallSums]:
     """Steady air of a hall whose fans have given speeds."""
     preset, units = LAYOUTS[layout]
@@ -47,8 +54,9 @@ def solved(
     hall = Hall(fleet, "f64", samples=False)
     speeds = np.broadcast_to(np.asarray(speed, np.float64), (fleet.units,)).copy()
     conditions = Conditions(
-        np.full(fleet.units, 20.0), np.full(1, load), unit_low=speeds, unit_high=speeds
-    )
+        np.full(fleet.units, 20.0), np.full(1, load), rack_load, unit_low=speeds,
+        unit_high=speeds, unit_running=running,
+    )  # fmt: skip
     return fleet, hall, hall.solve(conditions)
 
 
@@ -203,10 +211,173 @@ def test_a_hall_whose_racks_are_all_off_has_finite_air(thermal: str) -> None:
         assert 0.0 < result.inlet_max_c[0] < 200.0
 
 
+RETURN_SETPOINT = (
+    "hvac.crac.temperature_control=return", "hvac.setpoint.min_c=28", "hvac.setpoint.max_c=38",
+    "hvac.setpoint.initial_c=33",
+)  # fmt: skip
+OWN = "hvac.crac.return_air=own"
+# Halls whose return air acts on their supply air: layout, overrides, and units that run.
+RETURNS: dict[str, tuple[str, list[str], list[float]]] = {
+    "coils at their limit": (
+        "hall_of_2026",
+        ["hvac.crac.capacity_kw=[200, 520, 520, 520, 200, 520]"],
+        [1, 1, 1, 1, 1, 1],
+    ),
+    "a unit down": ("hall_of_2026", [*coupled(0.75, 4.0)], [1, 1, 0, 1, 1, 1]),
+    "fixed shares, a unit down": ("hall_of_2026", [*coupled(0.0)], [1, 0, 1, 1, 1, 1]),
+    "return-air control": ("hall_of_2026", [*RETURN_SETPOINT, *coupled(0.75)], [1, 1, 1, 1, 1, 1]),
+    "small units": (
+        "corrected",
+        ["hvac.crac.capacity_kw=[60, 200, 200, 200]", *coupled(1.0, 4.0)],
+        [1, 1, 1, 1],
+    ),
+}
+
+
+def returns_by_balance(fleet: Fleet, hall: Hall, result: HallSums) -> F64:
+    """Return air of each unit by balances of air and heat of every rack and unit, in C, (U,)."""
+    assert fleet.air is not None
+    assert fleet.air.return_shares is not None
+    heat_w = result.rack_cpu_w + result.rack_fan_w
+    recirculated_m3s = hall._places.values_of_racks(hall._memory["captured_m3s"][None])[0]
+    fresh_m3s = result.rack_airflow_m3s - recirculated_m3s
+    air = hall.intake_air(np.zeros(fleet.units))
+    layout_shares = fleet.air.unit_shares.reshape(fleet.racks, -1)
+    from_unit = weighted_shares(layout_shares, air.unit_weight) * air.fresh_ratio
+    from_unit /= from_unit.sum(axis=1, keepdims=True)
+    drawn_m3s = fresh_m3s @ from_unit
+    air_j_per_m3_k = fleet.dcs[row_index(DC_COEFFICIENTS, "air_j_per_m3_k"), 0]
+    returned_m3k_s = heat_w / air_j_per_m3_k + fresh_m3s * (from_unit @ air.supply_c)
+    to_unit = fleet.air.return_shares.reshape(fleet.racks, -1)
+    to_unit = weighted_shares(to_unit, unit_weights(to_unit, fresh_m3s, drawn_m3s))
+    bypass_m3s = result.unit_airflow_m3s - drawn_m3s
+    returned = returned_m3k_s @ to_unit + bypass_m3s * air.supply_c
+    return np.asarray(returned / result.unit_airflow_m3s)
+
+
+@pytest.mark.parametrize("kind", RETURNS)
+def test_own_returns_close_the_balances_of_air_and_heat(kind: str) -> None:
+    layout, overrides, running = RETURNS[kind]
+    runs = np.array(running, np.float64)
+    speed = np.where(runs > 0, np.linspace(1.0, 0.7, len(runs)), 0.1)
+    fleet, hall, result = solved(layout, speed, OWN, *overrides, running=runs)
+    offset_k = hall._unit_state["return_offset_k"]
+    return_c = result.units_return_c[0] + offset_k
+    flow_m3s = result.unit_airflow_m3s
+    mean_c = flow_m3s @ return_c / flow_m3s.sum()
+    assert mean_c == pytest.approx(result.units_return_c[0], rel=1e-12)
+    np.testing.assert_allclose(return_c, returns_by_balance(fleet, hall, result), rtol=1e-9)
+    assert np.ptp(return_c) > (0.15 if kind == "return-air control" else 0.5)
+    # Coils at their limit, units that are down and return-air control act on a unit's own return.
+    at_limit = flow_m3s * fleet.dcs[row_index(DC_COEFFICIENTS, "air_j_per_m3_k"), 0]
+    at_limit *= return_c - result.unit_supply_c
+    at_limit += 1e3 * fleet.unit_design_m3s * speed**3
+    limited = (runs > 0) & (result.unit_supply_c > 20.0 + 1e-6)
+    if kind == "return-air control":
+        rise_k = return_c - result.unit_supply_c
+        over_k = fleet.setpoint_over_supply_k[0]
+        share = np.maximum(0.0, over_k - rise_k) * (1.0 - 2.0 / over_k)
+        np.testing.assert_allclose(result.unit_supply_c, 20.0 + share, atol=1e-6)
+    else:
+        np.testing.assert_allclose(at_limit[limited], fleet.unit_capacity_w[limited], rtol=1e-6)
+        assert limited.any() == ("capacity" in overrides[0])
+    np.testing.assert_allclose(result.unit_supply_c[runs == 0], return_c[runs == 0], atol=1e-6)
+
+
+def test_the_unit_beside_dense_racks_draws_warmer_air() -> None:
+    """Racks of row 0 work, the others idle: units at the near ends of the walls draw their heat."""
+    values = ["hvac.crac.capacity_kw=520", "hvac.crac.supply_length_m=3", *coupled(0.0)]
+    load = np.repeat(np.where(np.arange(12) < 4, 1.0, 0.1), 18)
+    found = []
+    for kind in ("own", "common"):
+        _, hall, result = solved(
+            "hall_of_2026", 0.9, f"hvac.crac.return_air={kind}", *values, rack_load=load
+        )
+        found.append(result.units_return_c[0] + hall._unit_state["return_offset_k"])
+    own_c, common_c = found
+    # Units 0 and 1 stand beside the first rows, units 4 and 5 beside the last.
+    assert own_c[:2].min() > own_c[2:4].max() > own_c[4:].max()
+    np.testing.assert_array_equal(common_c, common_c[0])
+
+
+@pytest.mark.parametrize("kind", RETURNS)
+def test_steady_and_transient_own_returns_agree(kind: str) -> None:
+    layout, overrides, running = RETURNS[kind]
+    preset, units = LAYOUTS[layout]
+    down = [
+        f"{{kind: crac_down, unit: {k}, start_h: 0, duration_h: 99}}"
+        for k, runs in enumerate(running)
+        if not runs
+    ]
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 0.6)))
+    found = []
+    for thermal in ("quasi_steady", "transient"):
+        values = [
+            *units, GIVEN, OWN, *overrides, f"simulation.thermal={thermal}",
+            f"events.scheduled=[{', '.join(down)}]",
+        ]  # fmt: skip
+        with Simulator(load_config(preset, values), drivers=drivers, precision="f64") as sim:
+            sim.reset(0)
+            for _ in range(1 if thermal == "quasi_steady" else 24):
+                result = sim.step()
+            found.append(result)
+    np.testing.assert_allclose(found[1].unit_supply_c, found[0].unit_supply_c, atol=0.05)
+    np.testing.assert_allclose(found[1].rack_inlet_c, found[0].rack_inlet_c, atol=0.05)
+    np.testing.assert_allclose(found[1].hvac_w, found[0].hvac_w, rtol=2e-3)
+
+
+def test_a_unit_passes_its_own_return_air_while_it_is_down_and_after_its_restart() -> None:
+    event = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.5, duration_h: 1}]"
+    values = ["simulation.thermal=transient", "hvac.crac.supply_length_m=3", event]
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 0.6)))
+    found = {}
+    for kind in ("own", "common"):
+        config = load_config("hall_of_2026", [*values, f"hvac.crac.return_air={kind}"])
+        with Simulator(config, drivers=drivers, precision="f64") as sim:
+            sim.reset(0)
+            found[kind] = [(sim.step(), sim.state) for _ in range(12)]
+    for result, state in found["own"][3:6]:
+        assert result.unit_supply_c[0] == pytest.approx(state.return_air_c[0], abs=0.1)
+        assert abs(result.unit_supply_c[0] - result.return_c[0]) > 0.3
+    for _, state in found["common"][3:6]:
+        np.testing.assert_array_equal(state.return_air_c, state.return_air_c[0])
+    np.testing.assert_allclose(found["own"][11][0].unit_supply_c, 23.0, atol=0.05)
+
+
+@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_plain_halls_keep_their_bits_beside_halls_with_coupled_units(
+    thermal: str, precision: Any
+) -> None:
+    """Without coupling, oversupply and own returns a kernel without this work computes a hall."""
+    event = "events.scheduled=[{kind: crac_down, unit: 2, start_h: 0.5, duration_h: 0.5}]"
+    values = [
+        GIVEN, f"simulation.thermal={thermal}", "hvac.crac.units=4",
+        "hvac.crac.capacity_kw=[60, 200, 200, 200]", event, "name=plain",
+    ]  # fmt: skip
+    plain = load_config("corrected", [*values, *coupled(0.0), "hvac.crac.return_air=common"])
+    other = load_config("corrected", [*values, *coupled(0.75, 4.0), OWN, "name=other"])
+    results = []
+    for configs in ([plain], [plain, other], [other]):
+        with Simulator(configs, precision=precision) as sim:
+            sim.reset([0] * len(configs))
+            for _ in range(4):
+                result = sim.step(Actions(fan=np.tile([-3.0, 1, 0, 2], len(configs))))
+            results.append(result)
+    alone, beside, last = results
+    for name in ("rack_inlet_c", "unit_supply_c", "hvac_w", "return_c"):
+        first, second = np.split(getattr(beside, name), 2)
+        np.testing.assert_array_equal(first, getattr(alone, name))
+        np.testing.assert_array_equal(second, getattr(last, name))
+        assert not np.array_equal(first, second)
+
+
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_split_halls_and_batches_have_the_bits_of_one(precision: Any) -> None:
     """A large hall is split among threads; its weights need a call of their own."""
-    config = load_config("large", [GIVEN, *coupled(0.9, 4.0)])
+    config = load_config(
+        "large", [GIVEN, *coupled(0.9, 4.0), OWN, f"hvac.crac.capacity_kw={[1200] + [2000] * 9}"]
+    )
     fans = np.linspace(-6.0, 2.0, 10)
     results = []
     for batch in (1, 2):

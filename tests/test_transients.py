@@ -84,7 +84,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
         following=rng.uniform(0.2, 1.1, fleet.units),
         supply_excess_k=rng.uniform(0.0, 3.0, fleet.units),
         casing_c=rng.uniform(16, 40, fleet.units),
-        return_air_c=rng.uniform(25, 40, fleet.size),
+        return_air_c=rng.uniform(25, 40, fleet.size)[fleet.unit_dc],
         water_heat_j=np.zeros(fleet.size),
         tank_heat_j=np.zeros(fleet.size),
     )
@@ -119,7 +119,7 @@ def twin_memory(
         room_j=room_j,
         excess_k=state.supply_excess_k[part.units],
         casing_c=state.casing_c[part.units],
-        return_c=float(state.return_air_c[dc]),
+        return_c=float(state.return_air_c[part.units][0]),
     )
 
 
@@ -528,8 +528,9 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     layers = batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(fleet_of(config), precision)
-        of_units = "need_m3s", "plain_m3s", "following", "supply_excess_k", "casing_c"
-        of_dc = "return_air_c", "water_heat_j", "tank_heat_j"
+        of_units = ["need_m3s", "plain_m3s", "following", "supply_excess_k"]
+        of_units += ["casing_c", "return_air_c"]
+        of_dc = "water_heat_j", "tank_heat_j"
         where = {"server_c": part.groups} | dict.fromkeys(of_dc, slice(i, i + 1))
         where |= dict.fromkeys(of_units, part.units)
         own = own_conditions(met, configs, i)

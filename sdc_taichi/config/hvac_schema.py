@@ -131,6 +131,10 @@ class CracConfig(Section):
     """Coupling of the units by the plenum under a raised floor, 0..1: with 1 it has one pressure,
     so that racks draw from each unit in proportion to its airflow; with 0 each unit keeps its
     share in the supply of each rack while all units run."""
+    return_air: Literal["own", "common"] | None = None
+    """Return air of the units: ``own``, each draws the exhaust of the racks near it (weights as in
+    ``supply_length_m``, from the exhaust faces), or ``common``, all draw the mean of the hall.
+    None means ``common``."""
     capacity_kw: UnitCapacity | tuple[UnitCapacity, ...] | None = None
     """Largest heat that the coil of a unit removes, including the heat of its fan, in kW: one value
     for all units, or one per unit; None means that only the plant limits it."""
@@ -196,6 +200,11 @@ class CracConfig(Section):
     def coupling(self) -> float:
         """Coupling of the units by the plenum, 0..1; a single unit has none."""
         return self.plenum_coupling if self.units > 1 else 0.0
+
+    @property
+    def draws_own_return(self) -> bool:
+        """True if each unit draws its own return air; a single unit draws that of the hall."""
+        return self.units > 1 and self.return_air == "own"
 
     @property
     def sized_by_need(self) -> bool:

@@ -101,8 +101,21 @@ def unit_shares(plan: FloorPlan, units: int, length_m: float) -> F64:
         units: Number of CRAC units, U.
         length_m: Distance at which a share falls to 1/e, m.
     """
-    places = unit_places_m(plan, units)
-    distance = np.hypot(*np.moveaxis(plan.front_m[:, None] - places[None], -1, 0))
+    return _shares_by_distance(plan.front_m, unit_places_m(plan, units), length_m)
+
+
+def return_shares(plan: FloorPlan, units: int, length_m: float) -> F64:
+    """Return the share of each CRAC unit in the returns of each rack, (R, U); rows sum to 1.
+
+    A share is proportional to exp(-d/length_m), with the distance d from exhaust face to unit.
+    Arguments as in ``unit_shares``.
+    """
+    return _shares_by_distance(plan.back_m, unit_places_m(plan, units), length_m)
+
+
+def _shares_by_distance(face_m: F64, places: F64, length_m: float) -> F64:
+    """Return shares of units at ``places``, (U, 2), for rack faces, (R, 2), in m; (R, U)."""
+    distance = np.hypot(*np.moveaxis(face_m[:, None] - places[None], -1, 0))
     nearest = distance.min(axis=1, keepdims=True)
     weight = np.exp(-(distance - nearest) / length_m)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))

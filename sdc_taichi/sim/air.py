@@ -29,13 +29,14 @@ _AXES = {"unit": "U", "rack": "R"}
 """Axes of the fields of ``HallSums`` by the first part of their names; all other fields have one
 entry per data center, B."""
 STATE_AXES = {
-    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh", "return_air_c"), "B"),
+    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh"), "B"),
     **dict.fromkeys(("water_heat_j", "tank_heat_j"), "B"),
     **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
     **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),
     **dict.fromkeys(("group_inlet_c", "server_c"), "G"),
     **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
-    **dict.fromkeys(("need_m3s", "plain_m3s", "following", "supply_excess_k", "casing_c"), "U"),
+    **dict.fromkeys(("need_m3s", "plain_m3s", "following", "supply_excess_k"), "U"),
+    **dict.fromkeys(("casing_c", "return_air_c"), "U"),
 }
 """First axes of the fields of ``State``, except its seeds and its clock."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))

@@ -17,7 +17,7 @@ from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point, odd_airflow
 from sdc_taichi.hall.exposure import TileAir
-from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
+from sdc_taichi.hall.floor_plan import floor_plan, return_shares, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import DENSE_RACKS, MixWeights
 from sdc_taichi.hall.rack_servers import RackServers, air_properties, rack_servers
@@ -84,6 +84,9 @@ class HallAir:
     order, and for each rack the units of its data center."""
     rack_need_m3s: F64
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
+    return_shares: F64 | None
+    """Share of each CRAC unit in the returns of each rack, in the order of ``unit_shares``; 0 in
+    data centers whose units draw common return air. None if all do."""
     tiles: tuple[TileAir, ...]
     """Exhaust shares at other airflows of the racks, for each distinct hall; empty for sampled
     racks, which are loaded alike."""
@@ -143,6 +146,8 @@ class Fleet:
     their airflow, 0..1, (B,); 0 with a single unit."""
     oversupply_decay: F64
     """Decay of exhaust shares per excess of supply over need, dimensionless, (B,)."""
+    own_return: npt.NDArray[np.bool_]
+    """True if each CRAC unit draws its own return air, (B,); False with a single unit."""
     air: HallAir | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
 
@@ -275,6 +280,8 @@ class _Air:
     """Share of exhaust air in each rack's intake, for a server of height factor 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
+    return_shares: F64 | None
+    """Share of each CRAC unit in the returns of each rack, (R, U); None if they have one return."""
     rack_need_m3s: F64
     """Supply air that each rack draws in at the design point, in m3/s, (R,)."""
     tiles: TileAir
@@ -326,6 +333,9 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
         plenum_coupling=np.array([c.hvac.crac.coupling for c in listed]),
         oversupply_decay=np.array([c.hall.recirculation.oversupply_decay for c in listed]),
+        own_return=np.array(
+            [c.hvac.crac.draws_own_return and models["inlet"] == "recirculation" for c in listed]
+        ),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 
@@ -428,6 +438,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
             mix_weights=recirculation.mix_weights,
             exhaust_share=of_groups / servers.per_rack(servers.height_factor),
             unit_shares=shares,
+            return_shares=_return_shares(config, recirculation.need_m3s, unit_design_m3s),
             rack_need_m3s=recirculation.need_m3s,
             tiles=recirculation.tiles,
             steady_states=steady_states,
@@ -496,6 +507,21 @@ def _unit_supply(config: DataCenterConfig, recirculation: Recirculation) -> tupl
     return shares, airflow_m3s
 
 
+def _return_shares(config: DataCenterConfig, need_m3s: F64, unit_m3s: F64) -> F64 | None:
+    """Return the unit shares in the racks' returns at the design point, (R, U); None if common.
+
+    Args:
+        config: The data center.
+        need_m3s: Supply air that each rack draws in at the design point, and returns, m3/s, (R,).
+        unit_m3s: Airflow of each unit at full speed, m3/s, (U,).
+    """
+    crac = config.hvac.crac
+    if not crac.draws_own_return:
+        return None
+    shares = return_shares(floor_plan(config.hall), crac.units, crac.supply_length_m)
+    return weighted_shares(shares, unit_weights(shares, need_m3s, unit_m3s))
+
+
 def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers) -> F64:
     """Return the heat capacity of one server of each group, in J/K, (G,)."""
     kj_per_k = config.servers.heat_capacity_kj_per_k
@@ -523,10 +549,16 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
     distinct = list({id(air): air for air in airs}.values())
     entry_of = {id(air): i for i, air in enumerate(distinct)}
     entry = np.array([entry_of[id(air)] for air in airs], dtype=np.int32)
+    returns = [
+        np.zeros(air.unit_shares.size) if air.return_shares is None else air.return_shares.ravel()
+        for air in airs
+    ]
+    is_common = all(air.return_shares is None for air in distinct)
     return HallAir(
         mix_weights=_joined([air.mix_weights for air in distinct], entry),
         exhaust_share=np.concatenate([air.exhaust_share for air in airs]),
         unit_shares=np.concatenate([air.unit_shares.reshape(-1) for air in airs]),
+        return_shares=None if is_common else np.concatenate(returns),
         rack_need_m3s=np.concatenate([air.rack_need_m3s for air in airs]),
         unit_share_offsets=offsets_from_counts(
             [air.unit_shares.size for air in airs], "unit shares"

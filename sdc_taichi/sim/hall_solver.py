@@ -82,7 +82,7 @@ class HallState:
     casing_c: F64
     """Temperature of the air in the casing of each CRAC unit, in C, (U,)."""
     return_air_c: F64
-    """Temperature of the return air of the CRAC units, in C, (B,)."""
+    """Temperature of the return air of each CRAC unit, in C, (U,)."""
     water_heat_j: F64
     """Heat stored in the chilled water, with that of a mixed tank, relative to the water at its
     setpoint, in J, (B,)."""
@@ -260,6 +260,7 @@ class Hall:
         self._layers_kernel = NamedKernel(layers.layers_kernel(precision), LAYERS_ARGUMENTS)
         constant = tables.arrays | {
             "recirculates": self._recirculates,
+            "own_return": bool(fleet.own_return.any()),
             "slices": tables.slices,
             "one": 1,
             "outlet_model": OUTLETS.index(fleet.models["outlet"]),
@@ -448,7 +449,7 @@ class Hall:
             "following": (units, 1.0),
             "supply_excess_k": (units, 0.0),
             "casing_c": (units, mean_c[fleet.unit_dc]),
-            "return_air_c": (self.beyond_limits, mean_c),
+            "return_air_c": (units, mean_c[fleet.unit_dc]),
             "water_heat_j": (self.beyond_limits, 0.0),
             "tank_heat_j": (self.beyond_limits, 0.0),
         }
@@ -650,7 +651,7 @@ class Hall:
         running = self._unit["running"]
         any_running = fleet.unit_sums(running)[fleet.unit_dc] > 0.0
         passes_return_air = (running == 0.0) & any_running
-        coil_c = np.where(passes_return_air, state.return_air_c[fleet.unit_dc], coil_c)
+        coil_c = np.where(passes_return_air, state.return_air_c, coil_c)
         of_units = {
             "fresh_ratio": np.minimum(1.0, covers),
             "supply_ratio": np.minimum(ratio, MOST_SUPPLY_RATIO),
@@ -722,7 +723,7 @@ class Hall:
         entries, first = np.unique(air.steady_state_of_dc[self._sparse_dcs], return_index=True)
         dcs = dict(zip(entries.tolist(), self._sparse_dcs[first].tolist(), strict=True))
         modes: dict[int, SteadyModes] = {}
-        names = "adjusts_supply", "inlet_target_c", "coupling", "oversupply"
+        names = "adjusts_supply", "inlet_target_c", "coupling", "oversupply", "own_return"
         controls = [self._dc[name] for name in names]
         usual = [row.copy() for row in controls]
         for row in controls:
@@ -921,7 +922,8 @@ class Hall:
             following=self._unit_state["following"].copy(),
             supply_excess_k=self._unit_state["excess_k"].copy(),
             casing_c=self._unit_state["casing_c"].copy(),
-            return_air_c=self._dc["return_c"].copy(),
+            return_air_c=self._dc["return_c"][self._fleet.unit_dc]
+            + self._unit_state["return_offset_k"],
             water_heat_j=self._dc["water_j"].copy(),
             tank_heat_j=self._dc["tank_j"].copy(),
         )

@@ -37,6 +37,7 @@ from sdc_taichi.kernels.hall_arguments import (
     RACK_INPUTS,
     RACK_OUT,
     RACK_STATE,
+    RETURN_AIR,
     RUN_BLOCKS,
     RUN_INTS,
     RUN_LANES,
@@ -200,6 +201,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
     tables.rows("unit_inputs")["casing_m3"][:] = CASING_S * fleet.unit_design_m3s
     tables.rows("unit_state")["fitted_m3s"][:] = -1.0
+    tables.rows("unit_state")["return_offset_k"][:] = 0.0
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
 
@@ -397,7 +399,8 @@ def _build_air(
     air = fleet.air
     if air is None:
         return vectors(dtype, 1), vectors(dtype, 1, lanes=DENSE_LANES * LANES), first_mix_weight
-    shares, weights, first_of_entry, total = _shares_by_block(fleet, places), [], {}, 0
+    shares = _shares_by_block(fleet, places, air.unit_shares)
+    weights, first_of_entry, total = [], {}, 0
     for dc, racks in enumerate(np.diff(fleet.rack_offsets)):
         n_places = int(places.blocks[dc]) * LANES
         if racks > DENSE_RACKS:
@@ -421,33 +424,39 @@ def _build_air(
 
 
 def _build_plenum(fleet: Fleet, places: RackPlaces) -> dict[str, Array]:
-    """Return unit shares by block in f64, and the racks' need, of halls whose units are coupled."""
-    air = fleet.air
-    if air is None or not np.any(fleet.plenum_coupling > 0):
-        need, shares, lanes = vectors(np.float64, len(PLENUM_NEED), 1), [np.zeros((1, LANES))], 1
-    else:
-        lanes = fleet.units
-        need = vectors(np.float64, len(PLENUM_NEED), places.count // LANES)
+    """Return what weights of units are fitted to: shares by block, and airflows of the racks.
+
+    Fleets whose units are not coupled, or draw common return air, have arrays of one entry.
+    """
+    air, blocks, no_shares = fleet.air, places.count // LANES, [np.zeros((1, LANES))]
+    couples = air is not None and bool(np.any(fleet.plenum_coupling > 0))
+    need = vectors(np.float64, len(PLENUM_NEED), blocks if couples else 1)
+    supply = returns = no_shares
+    if air is not None and couples:
         need.reshape(len(need), -1)[:, places.of_racks] = air.rack_need_m3s
-        shares = _shares_by_block(fleet, places)
-    plenum_shares = vectors(np.float64, sum(map(len, shares)))
-    plenum_shares[:] = np.concatenate(shares)
-    return {
+        supply = _shares_by_block(fleet, places, air.unit_shares)
+    if air is not None and air.return_shares is not None:
+        returns = _shares_by_block(fleet, places, air.return_shares)
+    arrays = {
         "plenum_need": need,
-        "plenum_shares": plenum_shares,
-        "unit_lanes": vectors(np.float64, lanes),
+        "return_air": vectors(np.float64, len(RETURN_AIR), 1 if returns is no_shares else blocks),
+        "unit_lanes": vectors(np.float64, fleet.units),
     }
+    for name, shares in (("plenum_shares", supply), ("return_shares", returns)):
+        arrays[name] = vectors(np.float64, sum(map(len, shares)))
+        arrays[name][:] = np.concatenate(shares)
+    return arrays
 
 
-def _shares_by_block(fleet: Fleet, places: RackPlaces) -> list[Array]:
-    """Return the unit shares of all data centers by block, see ``shares_by_block``."""
+def _shares_by_block(fleet: Fleet, places: RackPlaces, flat_shares: F64) -> list[Array]:
+    """Return shares of units in racks of all data centers by block, see ``shares_by_block``."""
     assert fleet.air is not None
     shares = []
     for dc, (racks, units) in enumerate(
         zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
     ):
         at = fleet.air.unit_share_offsets[dc]
-        of_hall = fleet.air.unit_shares[at : at + racks * units].reshape(racks, units)
+        of_hall = flat_shares[at : at + racks * units].reshape(racks, units)
         shares.append(shares_by_block(of_hall, LANES))
         # Sparse halls are padded with blocks of zeros to whole vectors of RUN_LANES.
         shares.append(np.zeros((int(places.blocks[dc]) * units - len(shares[-1]), LANES)))
@@ -620,6 +629,7 @@ def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
     dc["coupling"][:] = fleet.plenum_coupling
     dc["follows_need"][:] = fleet.models["crac_flow"] == "follow_servers"
     dc["oversupply"][:] = fleet.oversupply_decay
+    dc["own_return"][:] = fleet.own_return
     dc["inlet_band_k"][:] = fleet.values("hvac.crac.inlet_band_k")
     dc["least_speed"][:] = fleet.values("hvac.crac.min_flow_ratio")
     rise_k = fleet.setpoint_over_supply_k

@@ -87,10 +87,12 @@ def sampled_fleet(fleet: Fleet, dcs: I64, modes: Mapping[int, SteadyModes]) -> F
         setpoint_over_supply_k=np.zeros(n),
         plenum_coupling=np.zeros(n),
         oversupply_decay=np.zeros(n),
+        own_return=np.zeros(n, np.bool_),
         air=HallAir(
             mix_weights=_sample_weights([modes[e] for e in entries]),
             exhaust_share=air.exhaust_share[racks],
             unit_shares=np.ones(len(racks)),
+            return_shares=None,
             rack_need_m3s=air.rack_need_m3s[racks],
             tiles=(),
             unit_share_offsets=rack_offsets,
