@@ -39,6 +39,11 @@ def days(start: str, stop: str) -> np.ndarray:
     return np.arange(np.datetime64(start, "D"), np.datetime64(stop, "D"))
 
 
+def hours(start: str, stop: str) -> list[str]:
+    """Every hour from the day start up to, not including, the day stop, as text."""
+    return np.arange(np.datetime64(start, "h"), np.datetime64(stop, "h")).astype(str).tolist()
+
+
 @cache
 def epw_lines(
     start: str = "2021-01-01", stop: str = "2022-01-01", per_hour: int = 1, offset: float = -5.0

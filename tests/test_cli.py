@@ -34,6 +34,7 @@ from sdc_taichi import (
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import View, make_controller
 from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_reader import read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
@@ -166,12 +167,19 @@ def test_steps_hold_every_quantity_of_every_step(two_sites: Path) -> None:
     with Simulator(load_config("tiny")) as sim:
         sim.reset()
         quantities = sim.step().per_dc()
-    assert list(steps.columns) == ["dc", "step", "time", *quantities]
+    assert list(steps.columns) == ["dc", "step", "time", "utc_offset_h", *quantities]
     assert steps["dc"].tolist() == ["ny", "ca"] * 192
     assert steps["step"].tolist() == np.repeat(np.arange(192), 2).tolist()
     assert not steps.isna().any().any()
-    first, last = steps["time"].iloc[0], steps["time"].iloc[-1]
-    assert (str(first), str(last)) == ("2001-07-01 00:00:00", "2001-07-02 23:45:00")
+    assert steps["utc_offset_h"].tolist() == [-5.0, -8.0] * 192
+    # Sites of different offsets share a column in UTC.
+    times = steps["time"].iloc[[0, 1, -1]].astype(str).tolist()
+    days = ["2018-07-01 05:00:00", "2018-07-01 08:00:00", "2018-07-03 07:45:00"]
+    assert times == [f"{each}+00:00" for each in days]
+    begin, last = "2018-07-01 00:00:00", "2018-07-02 23:45:00"
+    for dc, zone in zip(read_steps(read_run(two_sites), [0, 1]), ("-05:00", "-08:00"), strict=True):
+        local = dc["time"].iloc[[0, -1]].astype(str).tolist()
+        assert local == [f"{begin}{zone}", f"{last}{zone}"]
 
 
 def test_files_say_what_they_are(two_sites: Path) -> None:
@@ -214,6 +222,8 @@ def test_a_data_center_is_the_same_alone_and_in_a_fleet(tmp_path: Path) -> None:
     rows = steps_of(tmp_path / "fleet")
     rows = rows[rows["dc"] == "ny"].reset_index(drop=True)
     one = steps_of(tmp_path / "alone")
+    # Sites of different offsets share a column in UTC.
+    rows["time"] = rows["time"].dt.tz_convert(one["time"].dt.tz)
     pd.testing.assert_frame_equal(rows.drop(columns="dc"), one.drop(columns="dc"), check_exact=True)
 
 

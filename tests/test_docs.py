@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from sdc_taichi.cli.app import app
 from sdc_taichi.run.folder_reader import read_run
+from sdc_taichi.run.steps_file import KEY_COLUMNS
 from sdc_taichi.types import DATA_CENTERS, QUANTITIES, meanings
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -40,7 +41,7 @@ def names_in_first_column(text: str) -> list[str]:
 def test_every_column_of_steps_is_documented(run_folder: Path) -> None:
     columns = list(pd.read_parquet(run_folder / "steps.parquet").columns)
     per_dc = [name for name, each in QUANTITIES.items() if each.axis == DATA_CENTERS]
-    assert columns == ["dc", "step", "time", *per_dc]
+    assert columns == [*KEY_COLUMNS, *per_dc]
     assert [*meanings()] == [*QUANTITIES]
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import exogenous_builders as build
 from sdc_taichi import (
+    ConfigError,
     DataError,
     Drivers,
     drivers_from_arrays,
@@ -38,6 +39,41 @@ def test_utc_rows_shift_carbon_intensity_by_the_offset_of_the_site() -> None:
     noon, four = 48, 16
     assert shifted.at(noon).ci_g_per_kwh == local.at(four).ci_g_per_kwh
     assert shifted.at(noon).outdoor_c == local.at(noon).outdoor_c
+
+
+def test_time_stamps_have_the_year_of_config_weather_carbon_or_workload(tmp_path: Path) -> None:
+    typical = list(build.epw_lines("2021-01-01", "2021-07-01"))
+    typical += build.epw_lines("2015-07-01", "2016-01-01")[8:]
+    stamps = build.hours("2019-01-01", "2020-01-01")
+    workload = ["timestamp,cpu_load", *(f"{stamp}:00,0.5" for stamp in stamps)]
+    contents = {
+        "typical.epw": typical,
+        "measured.epw": list(build.epw_lines("2021-01-01", "2022-01-01")),
+        "carbon.csv": build.carbon_lines("2022-01-01", "2023-01-01"),
+        "workload.csv": workload,
+    }
+    for name, lines in contents.items():
+        (tmp_path / name).write_text(build.text(lines))
+
+    def stamp(*values: str) -> str:
+        settings = [value.replace("=@", f"={tmp_path}/") for value in values]
+        drivers = load_drivers([load_config("tiny", settings)])
+        return str(drivers.times(np.array([0]), 4)[0, 0])[:10]
+
+    measured, carbon = "site.weather_file=@measured.epw", "site.carbon_file=@carbon.csv"
+    trace = "site.workload_file=@workload.csv"
+    assert stamp("site.start=03-01") == "2018-03-01"
+    assert stamp("site.weather_file=@typical.epw") == "2018-01-01"
+    assert stamp("site.weather_file=@typical.epw", carbon) == "2022-01-01"
+    assert stamp(carbon, measured, trace) == "2021-01-01"
+    assert stamp(trace) == "2019-01-01"
+    assert stamp("site.year=2030", carbon, measured, trace) == "2030-01-01"
+
+
+@pytest.mark.parametrize("year", ["1899", "2101", "2018.5", "soon"])
+def test_years_that_are_none(year: str) -> None:
+    with pytest.raises(ConfigError, match=r"site\.year"):
+        load_config("tiny", [f"site.year={year}"])
 
 
 def test_copies_store_a_series_once() -> None:

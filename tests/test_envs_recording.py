@@ -149,7 +149,7 @@ def test_a_recording_holds_the_steps_and_the_rewards(tmp_path: Path) -> None:
     assert found["carbon [-]"].min() < 0
     day = int(played[0][1]["agent_ls"]["start_day"])
     first = entities["/dc/tiny/series/pue"]["sim_time"][0]
-    assert str(first) == str(np.datetime64("2001-01-01") + day) + " 00:00:00"
+    assert str(first) == str(np.datetime64("2018-01-01") + day) + " 00:00:00"
 
 
 # --- which episodes, which environments ---

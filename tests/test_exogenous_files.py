@@ -109,25 +109,28 @@ def test_half_hour_offsets_average_by_overlap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "stop", "minutes", "rows"),
+    ("start", "stop", "minutes", "rows", "year"),
     [
-        ("2024-01-01", "2025-01-01", 60, 8760),
-        ("2021-01-01", "2024-01-01", 60, 3 * 8760),
-        ("2023-01-01", "2026-01-01", 60, 3 * 8760),
-        ("2022-01-01", "2023-01-01", 5, 105_120),
-        ("2022-01-01", "2023-01-01", 30, 17_520),
-        ("2022-07-01", "2023-07-01", 60, 8760),
-        ("2023-07-01", "2024-07-01", 60, 8760),
-        ("2022-01-01", "2023-02-15", 60, 8760),
+        ("2024-01-01", "2025-01-01", 60, 8760, 2024),
+        ("2021-01-01", "2024-01-01", 60, 3 * 8760, 2021),
+        ("2023-01-01", "2026-01-01", 60, 3 * 8760, 2023),
+        ("2022-01-01", "2023-01-01", 5, 105_120, 2022),
+        ("2022-01-01", "2023-01-01", 30, 17_520, 2022),
+        ("2022-07-01", "2023-07-01", 60, 8760, 2022),
+        ("2023-07-01", "2024-07-01", 60, 8760, 2023),
+        ("2022-10-01", "2023-10-01", 60, 8760, 2023),
+        ("2021-10-01", "2024-10-01", 60, 3 * 8760, 2022),
+        ("2022-01-01", "2023-02-15", 60, 8760, 2022),
     ],
 )
 def test_any_span_and_resolution(
-    start: str, stop: str, minutes: int, rows: int, tmp_path: Path
+    start: str, stop: str, minutes: int, rows: int, year: int, tmp_path: Path
 ) -> None:
     lines = build.carbon_lines(start, stop, -8.0, minutes)
     series = read_carbon(write(tmp_path / "ci.csv", lines), -8.0)
     assert series.values.shape == (rows,)
     assert series.minutes == minutes
+    assert series.year == year
     by_step = series.values.reshape(-1, 1440 // minutes).mean(axis=0)
     half = by_step.size // 2
     assert set(np.argsort(by_step)[:2]) == {half - 1, half}
@@ -234,6 +237,7 @@ def test_epw_of_any_span_and_resolution(
     series = weather.outdoor_c
     assert series.values.shape == (rows,)
     assert series.minutes == 60 / per_hour
+    assert series.year == int(start[:4])
     assert (f"29 February removed ({removed} rows)" in series.notes) == bool(removed)
     by_day = series.values.reshape(-1, 24 * per_hour)
     assert 14 * per_hour <= int(by_day.mean(axis=0).argmax()) <= 16 * per_hour
@@ -248,6 +252,7 @@ def test_epw_mixed_years_are_one_year(tmp_path: Path) -> None:
     mixed = read_epw(write(tmp_path / "x.epw", lines))
     plain = read_epw(write(tmp_path / "y.epw", build.epw_lines()))
     np.testing.assert_array_equal(mixed.outdoor_c.values, plain.outdoor_c.values)
+    assert (mixed.outdoor_c.year, plain.outdoor_c.year) == (None, 2021)
 
 
 def test_epw_missing_codes_and_gaps_are_interpolated(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.types import F64, QUANTITIES, ServerLayers
-from sdc_taichi.viz import hall_rasters, recording_blocks, recording_series
+from sdc_taichi.viz import hall_rasters, plotting, recording_blocks, recording_series
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_text import failure_entries, protection_entries
 
@@ -103,9 +103,9 @@ class Run:
     recorded: dict[str, dict[str, list[Any]]]
 
     def column(self, name: str, dc: int) -> npt.NDArray[Any]:
-        """A column of steps.parquet."""
+        """A column of steps.parquet, with times as local standard time."""
         rows = self.steps[self.steps["dc"] == self.sim.fleet.names[dc]]
-        return rows[name].to_numpy()
+        return plotting.with_local_time(rows)[name].to_numpy()
 
 
 FOCUS = {0: "ny-0", 1: r"hall\/1\ \[a\]", 2: "ny-2"}

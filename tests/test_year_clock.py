@@ -37,7 +37,7 @@ def test_days_that_are_none(text: object) -> None:
 
 def test_step_times_leave_leap_days_out() -> None:
     steps = np.arange(5 * 8760)
-    hourly = step_times(np.array([0, 24]), steps, 1)
+    hourly = step_times(np.array([0, 24]), steps, 1, np.array([2001, 2001]))
     assert hourly.shape == (steps.size, 2)
     assert np.array_equal(hourly[24:, 0], hourly[:-24, 1])
     days = set(hourly[:, 0].astype("datetime64[D]").astype(str).tolist())
@@ -45,6 +45,13 @@ def test_step_times_leave_leap_days_out() -> None:
     assert {"2001-01-01", "2004-02-28", "2004-03-01", "2005-12-31"} <= days
     assert "2004-02-29" not in days
     assert np.all(np.diff(hourly[:, 0]) > np.timedelta64(0))
+
+
+def test_step_times_count_from_the_year_of_each_data_center() -> None:
+    start = np.array([0, 8759])
+    (first, next_step) = step_times(start, np.array([0, 1]), 1, np.array([2024, 1999])).astype(str)
+    assert first.tolist() == ["2024-01-01T00:00:00.000", "1999-12-31T23:00:00.000"]
+    assert next_step.tolist() == ["2024-01-01T01:00:00.000", "2000-01-01T00:00:00.000"]
 
 
 @pytest.mark.parametrize("year", [1900, 2000, 2023, 2024])

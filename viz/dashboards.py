@@ -2,7 +2,7 @@
 
 Every function takes a pandas DataFrame with a column ``time`` and the columns of
 ``StepResult.per_dc()``, one row per step, and returns a matplotlib ``Figure``. Times are local
-standard time; the year is a placeholder.
+standard time.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from .plotting import (
     step_hours,
     style_axes,
     style_axes_with_legend,
+    with_local_time,
 )
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def day(
     """
     figure = new_figure(12.0, 12.0)
     check_steps(steps, PANEL_COLUMNS)
-    check_steps(steps, ("time", *DAY_COLUMNS))
+    steps = check_steps(steps, ("time", *DAY_COLUMNS))
     first, after = rows_of_day(steps, date)
     shown = steps.iloc[first:after]
     check_steps(shown, PANEL_COLUMNS)
@@ -141,8 +142,8 @@ def day(
 
 def hottest_day(steps: pd.DataFrame) -> str:
     """Return the day with the hottest rack inlet of the run, YYYY-MM-DD; the earliest on a tie."""
-    hottest = steps["time"].iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
-    return str(hottest.strftime("%Y-%m-%d"))
+    row = int(rank(steps["inlet_max_c"].to_numpy()).argmax())
+    return str(with_local_time(steps)["time"].iloc[row].strftime("%Y-%m-%d"))
 
 
 def year(steps: pd.DataFrame, title: str = "") -> Figure:
@@ -157,7 +158,7 @@ def year(steps: pd.DataFrame, title: str = "") -> Figure:
     """
     figure = new_figure(14.0, 12.5)
     columns = {name for name, *_ in CARPETS} - {"carbon_kg_per_h"}
-    check_steps(steps, ("time", *sorted(columns), *ENERGY_COLUMNS))
+    steps = check_steps(steps, ("time", *sorted(columns), *ENERGY_COLUMNS))
     step_h = step_hours(steps)
     if len(steps) * step_h < 48.0:
         raise SdcError(
@@ -190,7 +191,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
         SdcError: matplotlib or a column is missing.
     """
     figure = new_figure(14.0, 4.8)
-    check_steps(steps, ("time", "outdoor_c", "it_w", "hvac_w", "setpoint_c", "inlet_max_c"))
+    steps = check_steps(steps, ("time", "outdoor_c", "it_w", "hvac_w", "setpoint_c", "inlet_max_c"))
     shown = steps[(steps["it_w"] > 0).to_numpy()]
     # Points are drawn in a fixed random order, so that no season covers the points of another.
     shown = shown.iloc[np.random.default_rng(0).permutation(len(shown))[:MAX_SCATTER_POINTS]]
@@ -232,7 +233,7 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
         SdcError: matplotlib or a column is missing.
     """
     figure = new_figure(9.0, 8.0)
-    check_steps(steps, ("time", "ci_g_per_kwh", "charge_kwh", "discharge_kwh", "soc"))
+    steps = check_steps(steps, ("time", "ci_g_per_kwh", "charge_kwh", "discharge_kwh", "soc"))
     step_h = step_hours(steps)
     hours = _hour_of_day(steps)
     panels = figure.subplots(3, 1, sharex=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.exogenous.year_clock import day_of_year, step_times
+from sdc_taichi.exogenous.year_clock import TYPICAL_YEAR, day_of_year, step_times
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
 
@@ -112,7 +112,7 @@ def overview(steps: pd.DataFrame) -> Figure:
             not increase.
     """
     figure = new_figure(12.0, 9.0)
-    check_steps(steps, PANEL_COLUMNS)
+    steps = check_steps(steps, PANEL_COLUMNS)
     draws = (draw_temperatures, draw_power, draw_carbon, draw_storage)
     all_axes = figure.subplots(4, 1, sharex=True, height_ratios=[3, 4, 3, 3])
     for axes, draw in zip(all_axes, draws, strict=True):
@@ -124,11 +124,12 @@ def overview(steps: pd.DataFrame) -> Figure:
 def step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
     """Return the time at which a step begins, on the clock of a data center.
 
-    The time is local standard time in a placeholder year, as in steps.parquet.
+    The time is local standard time in the year of the config, or else ``TYPICAL_YEAR``.
     """
-    day = day_of_year(fleet.configs[dc].site.start)
-    start = np.array([day * 24 * fleet.steps_per_hour])
-    times = step_times(start, np.array([result.step]), fleet.steps_per_hour)
+    site = fleet.configs[dc].site
+    start = np.array([day_of_year(site.start) * 24 * fleet.steps_per_hour])
+    year = np.array([TYPICAL_YEAR if site.year is None else site.year])
+    times = step_times(start, np.array([result.step]), fleet.steps_per_hour, year)
     return np.datetime64(times[0, 0], "s")
 
 
@@ -296,9 +297,9 @@ def optimum_day(
             does not contain the day.
     """
     figure = new_figure(11.0, 9.0)
+    steps_of = {label: check_steps(each, OPTIMUM_COLUMNS) for label, each in steps_of.items()}
     first = next(iter(steps_of.values()))
     for label, steps in steps_of.items():
-        check_steps(steps, OPTIMUM_COLUMNS)
         if not np.array_equal(steps["time"], first["time"]):
             raise SdcError(f"steps of {label}: of other times than the first")
     rows = rows_of_day(first, date)

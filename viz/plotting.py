@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError, printable
-from sdc_taichi.exogenous.year_clock import FIRST_YEAR
 from sdc_taichi.hall.air_metrics import TIE_K
 from sdc_taichi.types import F64
 
@@ -142,15 +141,31 @@ def date_text(moment: datetime, *, over_a_year: bool) -> str:
 
     Args:
         moment: the time.
-        over_a_year: True if the run is longer than a year; the text then includes the number of
-            the year in the run.
+        over_a_year: True if the run is longer than a year; the text then includes the year.
     """
-    year = f" (year {moment.year - FIRST_YEAR + 1})" if over_a_year else ""
+    year = f" {moment.year}" if over_a_year else ""
     return f"{moment.day} {moment:%B}{year}"
 
 
-def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
-    """Check that a DataFrame contains the steps of one data center.
+def with_local_time(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return steps whose column ``time`` is local standard time without a UTC offset.
+
+    Args:
+        steps: steps of one data center. A column ``utc_offset_h`` gives its local standard time
+            minus UTC, in h, if ``time`` is in UTC because its table has data centers of different
+            offsets.
+    """
+    times = steps["time"]
+    if times.dt.tz is None:
+        return steps
+    if "utc_offset_h" in steps.columns:
+        offset = (60 * steps["utc_offset_h"]).round().astype("timedelta64[m]")
+        return steps.assign(time=times.dt.tz_convert(None) + offset)
+    return steps.assign(time=times.dt.tz_localize(None))
+
+
+def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> pd.DataFrame:
+    """Check that a DataFrame contains the steps of one data center; return it in local time.
 
     Args:
         steps: one row per step.
@@ -162,12 +177,14 @@ def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
     missing = [name for name in columns if name not in steps.columns]
     if missing:
         raise SdcError(f"steps: missing columns {', '.join(missing)}")
+    steps = with_local_time(steps)
     times = steps["time"].to_numpy()
     if len(times) < 2 or not np.all(times[1:] > times[:-1]):
         raise SdcError(
             f"steps: {len(times)} rows; valid are two or more with increasing time, "
             "of one data center"
         )
+    return steps
 
 
 def is_over_a_year(steps: pd.DataFrame) -> bool:
@@ -340,7 +357,7 @@ def style_axes_with_legend(axes: Axes) -> None:
 
 
 def format_time_axis(axes: Axes) -> None:
-    """Label a time axis with days and hours, without the year, which is a placeholder."""
+    """Label a time axis with days and hours, without the year."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     # With another minimum number of ticks the locator warns that it finds no interval for runs of

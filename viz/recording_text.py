@@ -310,8 +310,7 @@ def summary_markdown(
         "# sdc-taichi",
         f"{_count_text(fleet.size, 'data center')}, {_count_text(fleet.racks, 'rack')}, "
         f"{_count_text(fleet.servers, 'server')}; a step is {60 // fleet.steps_per_hour} minutes. "
-        "Times are the start of the step, local standard time of the data center, in the year "
-        "2001.",
+        "Times are the start of the step, local standard time of the data center.",
         "",
         f"Series have every step, heat maps every {map_every}, the 3D hall every {hall_every}, "
         f"while an event lasts every {in_events}. There the front of a rack shows the hottest "

@@ -14,7 +14,7 @@ A recording has these entities, where NAME is the name of a data center in focus
     summary                            static text
 
 Its timelines are ``step``, counted from 0 at reset, and ``sim_time``, the start of the step on the
-clock of the data center (see ``year_clock.step_times``). Entities of the fleet use the clock of
+clock of the data center (see ``Drivers.times``). Entities of the fleet use the clock of
 the first data center in focus.
 """
 
@@ -28,7 +28,6 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c, rank
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, StepResult
@@ -118,7 +117,7 @@ class RecordingWriter:
         """Hottest inlet of each data center in focus, in C, (T, n) of each block."""
         self._fleet, self._description, self._output = fleet, description, output
         self._names, self._focus = names, focus
-        self._start = sim.drivers.start[focus]
+        self._drivers = sim.drivers.take(focus)
         self._cadence = choose_cadence(fleet, focus, every_steps)
         self._builder = BlockBuilder(sim, focus, self._cadence)
         self._rows_and_factors = {
@@ -420,7 +419,7 @@ class RecordingWriter:
 
         Their shape is (T, n).
         """
-        return step_times(self._start, steps, self._fleet.steps_per_hour)
+        return self._drivers.times(steps, self._fleet.steps_per_hour)
 
     def _clock_texts(self, steps: I64, index: int) -> list[str]:
         """Return the times at which steps begin in a data center in focus, as ``MM-DD hh:mm``."""

@@ -155,12 +155,13 @@ def local_time(run: RunFolder, dc: int, step: int) -> datetime:
     per_hour = round(1 / run.metrics["step_h"])
     first_day = day_of_year(run.metrics["data_centers"][dc]["start"])
     start = np.array([first_day * 24 * per_hour])
-    moment: datetime = step_times(start, np.array([step]), per_hour)[0, 0].astype(datetime)
+    year = np.array([run.metrics["data_centers"][dc]["year"]])
+    moment: datetime = step_times(start, np.array([step]), per_hour, year)[0, 0].astype(datetime)
     return moment
 
 
 def time_text(run: RunFolder, moment: datetime) -> str:
-    """Return day and time of day as text, with the number of the year in runs over a year."""
+    """Return day and time of day as text, with the year in runs over a year."""
     day = date_text(moment, over_a_year=run.hours > HOURS_PER_YEAR)
     return f"{day} {moment:%H:%M}"
 

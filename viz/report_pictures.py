@@ -25,7 +25,7 @@ from sdc_taichi.run.folder_reader import (
 from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks, remarks_beside
 
 from . import dashboards, data_figures, figures, fleet_figures
-from .plotting import format_number, scale_thousands
+from .plotting import format_number, scale_thousands, with_local_time
 from .report_html import (
     DASH,
     MAX_ROWS,
@@ -127,7 +127,7 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
     shown = list(reasons)
     parts = read_steps(run, shown), read_racks(run, shown), read_configs(run, shown)
     return [
-        ShownDataCenter(index, reason, steps, racks, config)
+        ShownDataCenter(index, reason, with_local_time(steps), racks, config)
         for (index, reason), steps, racks, config in zip(reasons.items(), *parts, strict=True)
     ]
 

@@ -27,7 +27,6 @@ from sdc_taichi import (
     simulate,
 )
 from sdc_taichi.control import PERFECT, Controller
-from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.learning.split import HELD_OUT, first_day
 from sdc_taichi.optimum import solve
 from sdc_taichi.run.achievable import AchievedPath, run_beside
@@ -149,7 +148,7 @@ def steps_under(sim: Simulator, controller: Controller, steps: int) -> pd.DataFr
         name: [float(getattr(result, name)[0]) for result in results]
         for name in (*OPTIMUM_COLUMNS[1:], "carbon_g")
     }
-    times = step_times(sim.drivers.start, np.arange(steps), sim.fleet.steps_per_hour)
+    times = sim.drivers.times(np.arange(steps), sim.fleet.steps_per_hour)
     return pd.DataFrame({"time": times[:, 0], **columns})
 
 

@@ -61,7 +61,7 @@ def draw_week(folder: Path) -> None:
             load = command if command < 0.0 else COMMAND_SHARE * command
             results.append(sim.step(Actions(load=load, battery=COMMAND_SHARE * command)))
     rows = [{name: values[0] for name, values in result.per_dc().items()} for result in results]
-    times = pd.date_range("2001-07-01", periods=WEEK, freq="15min")
+    times = pd.date_range("2018-07-01", periods=WEEK, freq="15min")
     steps = pd.DataFrame({"time": times}).join(pd.DataFrame(rows))
     hottest = max(results, key=lambda result: float(result.rack_outlet_c.max()))
     hall_map(hottest, sim.fleet).savefig(folder / "hall.png")

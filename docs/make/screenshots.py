@@ -30,7 +30,7 @@ from sdc_taichi.viz.recording_output import HOST, check_port, listens, served_at
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
-START = "2001-07-01"
+START = "2018-07-01"
 STEPS_PER_HOUR = 12
 BOTH_DOWN = f"{START}T16:30"
 HOT_SPOT = {

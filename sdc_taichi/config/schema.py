@@ -38,7 +38,7 @@ from sdc_taichi.config.hall_schema import (
 )
 from sdc_taichi.config.hvac_schema import HvacConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.exogenous.year_clock import YEARS, day_of_year
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
 
@@ -145,6 +145,9 @@ class SiteConfig(Section):
     list``)."""
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
+    year: Annotated[int, Field(ge=YEARS[0], le=YEARS[1])] | None = None
+    """Calendar year of the first step in time stamps; None uses the year of the weather, carbon or
+    workload file, the first of them that has one, or else 2018. It selects no data."""
     seed: Seed = 10
     """Seed of the synthetic year, which does not affect imported data."""
     weather_file: FileName | None = None

@@ -17,6 +17,7 @@ from sdc_taichi.exogenous.series import FloatArray, Series
 from sdc_taichi.exogenous.series_file import Quantity
 from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_notes
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
+from sdc_taichi.exogenous.year_clock import UTC_OFFSETS_H
 
 Pairing = Literal["local", "utc_rows"]
 """Treatment of UTC rows: moved to local standard time, or kept as if UTC were local time."""
@@ -72,7 +73,7 @@ def read_carbon(
         DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     path = Path(path)
-    if not (np.isfinite(utc_offset_h) and -12.0 <= utc_offset_h <= 14.0):
+    if not (np.isfinite(utc_offset_h) and UTC_OFFSETS_H[0] <= utc_offset_h <= UTC_OFFSETS_H[1]):
         raise DataError(f"utc_offset_h: {utc_offset_h!r}, expected -12 to 14")
     if stamp not in ("auto", "start", "end"):
         raise DataError(f"stamp: {shortened(stamp)}, expected 'auto', 'start' or 'end'")
@@ -101,10 +102,17 @@ def read_carbon(
         )
         local = local - shift * np.timedelta64(round(minutes * 60), "s")
         notes.append(note)
-    intensity, year_notes = files.calendar_years(path, intensity, local, minutes)
+    intensity, year, year_notes = files.calendar_years(path, intensity, local, minutes)
     notes += year_notes
     return Series(
-        intensity, minutes, "ci_g_per_kwh", "g/kWh", path.name, synthetic=False, notes=tuple(notes)
+        intensity,
+        minutes,
+        "ci_g_per_kwh",
+        "g/kWh",
+        path.name,
+        synthetic=False,
+        notes=tuple(notes),
+        year=year,
     )
 
 

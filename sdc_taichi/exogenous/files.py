@@ -454,7 +454,7 @@ def whole_years(
 
 def calendar_years(
     path: Path | str, values: FloatArray, start: np.datetime64, minutes: float
-) -> tuple[FloatArray, list[str]]:
+) -> tuple[FloatArray, int, list[str]]:
     """Cut contiguous calendar values to whole 365-day years, as ``whole_years`` does.
 
     Args:
@@ -464,7 +464,8 @@ def calendar_years(
         minutes: resolution, in minutes.
 
     Returns:
-        Values, shape (years * rows per year, ...), and notes.
+        Values, shape (years * rows per year, ...); calendar year of most of the first 365 days; and
+        notes.
 
     Raises:
         DataError: the values cover fewer than 365 days.
@@ -473,7 +474,25 @@ def calendar_years(
     first = start + np.timedelta64(round(float(np.argmin(leap)) * minutes * 60), "s")
     since_minutes = 0.0 if leap.all() else minutes_into_year(first)
     values, notes = whole_years(path, values[~leap], since_minutes, minutes)
-    return values, [f"29 February removed ({int(leap.sum())} rows)"] * bool(leap.any()) + notes
+    year = first_calendar_year(first, since_minutes, len(values) * minutes)
+    removed = [f"29 February removed ({int(leap.sum())} rows)"] * bool(leap.any())
+    return values, year, removed + notes
+
+
+def first_calendar_year(first: np.datetime64, since_minutes: float, length_minutes: float) -> int:
+    """Return the calendar year of most of the first 365 days of values that ``whole_years`` cut.
+
+    ``whole_years`` moves values before the first 1 January to the end. Several years then begin
+    with the next calendar year; a single year consists of days of both.
+
+    Args:
+        first: local start of the first value.
+        since_minutes: the same, in minutes since 1 January 00:00 of a 365-day year.
+        length_minutes: length of the values that were cut to whole years, in minutes.
+    """
+    year = int(first.astype("datetime64[Y]").astype(np.int64)) + 1970
+    latest = MINUTES_PER_YEAR / 2 if length_minutes < 1.5 * MINUTES_PER_YEAR else 0.0
+    return year + int(since_minutes > latest)
 
 
 def leap_days(count: int, start: np.datetime64, minutes: float) -> NDArray[np.bool_]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -134,12 +134,15 @@ def import_weather(
         weather = read_epw(path)
     else:
         weather = read_weather_table(path, place, columns=columns, stamp=stamp)
-    series = (
+    series = [
         weather.outdoor_c,
         weather.wet_bulb_c,
         weather.relative_humidity_pct,
         weather.pressure_pa,
-    )
+    ]
+    if origin is not None and place is not None:
+        # Services offer tables of typical years, whose stamps have a placeholder for the year.
+        series = [x and replace(x, year=None) for x in series]
     metadata = {
         "kind": "weather",
         "label": weather.label,
@@ -338,6 +341,7 @@ def _store(
             **metadata,
             "name": name,
             "minutes": series[0].minutes,
+            "year": series[0].year,
             "source_file": source.name,
             "sha256": files.sha256(source),
             "notes": list(notes),

@@ -56,6 +56,8 @@ class Series:
     """True if the values were generated, False if they were measured."""
     notes: tuple[str, ...] = field(default=())
     """Repairs with their counts, and warnings."""
+    year: int | None = None
+    """Calendar year of most of the first 365 days; None for generated and typical years."""
 
     def __post_init__(self) -> None:
         """Take a read-only copy of the values and check them.

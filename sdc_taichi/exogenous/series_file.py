@@ -18,6 +18,7 @@ from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import DataError, SdcError, shortened
 from sdc_taichi.exogenous.files import check_length, fault, read_arrow, read_schema, rows_per_year
 from sdc_taichi.exogenous.series import FloatArray, Series
+from sdc_taichi.exogenous.year_clock import YEARS
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -117,6 +118,12 @@ def read_series(
         origin = metadata_value(path, metadata, "origin", dict)
         source = f"{origin.get('service')}: {source}"
     source = f"{source} (sha256 {digest[:12]})"
+    year = None
+    if metadata.get("year") is not None:
+        year = metadata_value(path, metadata, "year", int)
+        if not YEARS[0] <= year <= YEARS[1]:
+            valid = f"{YEARS[0]} to {YEARS[1]}"
+            raise DataError(f"{path}: metadata year: {year}, expected {valid}")
     table = read_arrow(path)
     series = {}
     for name, quantity in quantities.items():
@@ -125,7 +132,7 @@ def read_series(
         if values.size % rows_per_year(path, minutes):
             raise DataError(f"{path}: {values.size} rows, expected whole years of 365 days")
         series[name] = Series(
-            values, minutes, name, quantity.unit, source, synthetic=False, notes=notes
+            values, minutes, name, quantity.unit, source, synthetic=False, notes=notes, year=year
         )
     return series
 

@@ -28,6 +28,8 @@ from sdc_taichi.exogenous.year_clock import (
     FIRST_DAY_OF_MONTH,
     HOURS_PER_YEAR,
     MINUTES_PER_DAY,
+    UTC_OFFSETS_H,
+    YEARS,
 )
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.user_file import MOST_TABLE_BYTES, open_input, read_bytes
@@ -54,6 +56,7 @@ class _Column(NamedTuple):
 
 
 _FAHRENHEIT = " C (degrees Fahrenheit taken for C?)"
+_YEAR = "year"
 _MONTH, _DAY, _HOUR = "month (column 2)", "day (column 3)", "hour (column 4)"
 _DRY_BULB = _Column("dry bulb (column 7)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
 HUMIDITY_LIMITS_PCT = (0.0, 110.0)
@@ -62,7 +65,7 @@ _DEW_POINT = _Column("dew point (column 8)", OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT
 _HUMIDITY = _Column("relative humidity (column 9)", HUMIDITY_LIMITS_PCT, 999.0)
 _PRESSURE = _Column("station pressure (column 10)", PRESSURE_LIMITS_PA, 999_999.0)
 _MEASURED = (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE)
-_COLUMN_NAMES = ["year", _MONTH, _DAY, _HOUR, "minute", "source", *(c.name for c in _MEASURED)]
+_COLUMN_NAMES = [_YEAR, _MONTH, _DAY, _HOUR, "minute", "source", *(c.name for c in _MEASURED)]
 """Names of the first columns of a row; no other columns are read."""
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns from which the weather is built; the dew point is only checked."""
@@ -126,7 +129,31 @@ def read_epw(path: str | Path) -> Weather:
     notes += column_notes + absent_notes + year_notes
     notes += _pressure_notes(air.pressure_pa, minutes, location["elevation_m"])
     design, design_notes = _design_conditions(lines)
-    return make_weather(path, location, minutes, air, notes + design_notes, design)
+    year = _calendar_year(table, hours, len(values) * minutes)
+    return make_weather(path, location, minutes, air, notes + design_notes, design, year=year)
+
+
+def _calendar_year(
+    table: files.Table, hours: NDArray[np.int64], length_minutes: float
+) -> int | None:
+    """Return the calendar year of most of the first 365 days; None for typical years.
+
+    The months of a typical year are of different years, so that its dates do not follow each other.
+
+    Args:
+        table: rows of the file, without 29 February.
+        hours: hour of the 365-day year of each row, (T,).
+        length_minutes: length of the values that were cut to whole years, in minutes.
+    """
+    import pandas as pd
+
+    years = pd.to_numeric(table.frame[_YEAR], errors="coerce").to_numpy(np.float64)
+    is_new_year = np.diff(hours, prepend=hours[0]) < 0
+    is_valid = (years >= YEARS[0]) & (years <= YEARS[1])
+    if not np.array_equal(np.diff(years, prepend=years[0]), is_new_year) or not is_valid.all():
+        return None
+    first = np.datetime64(str(int(years[0])), "Y")
+    return files.first_calendar_year(first, float(hours[0]) * 60.0, length_minutes)
 
 
 class Air(NamedTuple):
@@ -147,6 +174,8 @@ def make_weather(
     air: Air,
     notes: Sequence[str],
     design: DesignConditions | None = None,
+    *,
+    year: int | None,
 ) -> Weather:
     """Build the weather of measured air, and compute its wet bulb.
 
@@ -157,11 +186,14 @@ def make_weather(
         air: measured air.
         notes: repairs and warnings.
         design: design conditions in the file; None if it has none.
+        year: calendar year of most of the first 365 days; None for a typical year.
     """
     wet_bulb, all_notes = wet_bulb_c(*air), list(notes)
 
     def series(name: str, unit: str, x: FloatArray) -> Series:
-        return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(all_notes))
+        return Series(
+            x, minutes, name, unit, path.name, synthetic=False, notes=tuple(all_notes), year=year
+        )
 
     if design is None:
         dry_c = rarely_exceeded(series("outdoor_c", "C", air.outdoor_c))
@@ -261,7 +293,7 @@ def _location(path: Path, lines: list[str]) -> dict[str, Any]:
     for field, name, at, low, high in (
         ("latitude_deg", "latitude", 6, -90.0, 90.0),
         ("longitude_deg", "longitude", 7, -180.0, 180.0),
-        ("utc_offset_h", "UTC offset", 8, -12.0, 14.0),
+        ("utc_offset_h", "UTC offset", 8, *UTC_OFFSETS_H),
         ("elevation_m", "elevation", 9, -1000.0, 9999.9),
     ):
         try:

@@ -26,6 +26,7 @@ from sdc_taichi.exogenous.weather import (
     make_weather,
     spike_notes,
 )
+from sdc_taichi.exogenous.year_clock import UTC_OFFSETS_H
 
 _LIMITS = {
     "dry_bulb": OUTDOOR_LIMITS_C,
@@ -94,7 +95,7 @@ def read_weather_table(
     values, rows, absent_notes = table.spread(values, positions)
     values = files.fill_gaps(path, values, minutes, names, rows)
     notes += spike_notes(values[:, 0], minutes, rows)
-    values, year_notes = files.calendar_years(path, values, stamps[0], minutes)
+    values, year, year_notes = files.calendar_years(path, values, stamps[0], minutes)
     notes += absent_notes + year_notes
     outdoor, humidity = values[:, 0], values[:, 1]
     if humid == "dew_point":
@@ -105,7 +106,8 @@ def read_weather_table(
     else:
         pressure = np.full(len(values), float(standard_pressure_pa(place.elevation_m)))
         notes.append(f"pressure of the standard atmosphere at {place.elevation_m:g} m")
-    return make_weather(path, place._asdict(), minutes, Air(outdoor, humidity, pressure), notes)
+    air = Air(outdoor, humidity, pressure)
+    return make_weather(path, place._asdict(), minutes, air, notes, year=year)
 
 
 def _check(place: Place) -> None:
@@ -113,7 +115,7 @@ def _check(place: Place) -> None:
         "latitude": (place.latitude_deg, -90.0, 90.0),
         "longitude": (place.longitude_deg, -180.0, 180.0),
         "elevation": (place.elevation_m, -1000.0, 9999.9),
-        "utc-offset": (place.utc_offset_h, -12.0, 14.0),
+        "utc-offset": (place.utc_offset_h, *UTC_OFFSETS_H),
     }
     for name, (value, low, high) in limits.items():
         if not low <= value <= high:

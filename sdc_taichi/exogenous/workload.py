@@ -65,13 +65,21 @@ def read_workload(
     values = files.fill_gaps(path, grid, minutes, ["cpu_load"], rows)[:, 0]
     if values.size % 168 == 0 and np.array_equal(values[168:], values[:-168]):
         notes.append(f"warning: the same 168 rows repeat {values.size // 168} times")
+    year = None
     if first_stamp is None:
         values, year_notes = files.whole_years(path, values, 0.0, minutes)
     else:
-        values, year_notes = files.calendar_years(path, values, first_stamp, minutes)
+        values, year, year_notes = files.calendar_years(path, values, first_stamp, minutes)
     notes += year_notes
     return Series(
-        values, minutes, "utilisation", "1", path.name, synthetic=False, notes=tuple(notes)
+        values,
+        minutes,
+        "utilisation",
+        "1",
+        path.name,
+        synthetic=False,
+        notes=tuple(notes),
+        year=year,
     )
 
 

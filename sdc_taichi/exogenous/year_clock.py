@@ -29,8 +29,13 @@ MINUTES_PER_DAY = 24 * 60
 """Number of minutes in a day: 1440."""
 MINUTES_PER_YEAR = MINUTES_PER_DAY * DAYS_PER_YEAR
 """Number of minutes in a year: 525,600."""
-FIRST_YEAR = 2001
-"""Calendar year assigned to the first simulated year in time stamps; it has no other meaning."""
+TYPICAL_YEAR = 2018
+"""Calendar year of runs whose config and input files name none, such as those of typical years. It
+has 365 days and begins on a Monday, like every year of the tariffs."""
+YEARS = (1900, 2100)
+"""First and last valid calendar year of a first step."""
+UTC_OFFSETS_H = (-12.0, 14.0)
+"""Smallest and largest valid local standard time minus UTC, in h."""
 MOST_DAYS = 36_500
 """Maximum length of a run, in days: a century."""
 
@@ -77,22 +82,26 @@ def day_of_year(month_day: object) -> int:
 
 
 def step_times(
-    start: npt.NDArray[np.int64], steps: npt.NDArray[np.int64], steps_per_hour: int
+    start: npt.NDArray[np.int64],
+    steps: npt.NDArray[np.int64],
+    steps_per_hour: int,
+    year: npt.NDArray[np.int64],
 ) -> npt.NDArray[np.datetime64]:
     """Return the local standard time at which each step begins.
 
-    Years are numbered 2001, 2002 and so on; the 29 February of a calendar leap year is skipped.
+    The 29 February of a calendar leap year is skipped.
 
     Args:
         start: first step of each data center, counted from the beginning of its year, (B,).
         steps: steps since reset, (n,).
         steps_per_hour: number of steps in an hour.
+        year: calendar year of the first step of each data center, (B,).
 
     Returns:
         Time stamps in milliseconds, (n, B).
     """
     minutes = (start + steps[:, None]) * (60 // steps_per_hour)
-    years, within = FIRST_YEAR + minutes // MINUTES_PER_YEAR, minutes % MINUTES_PER_YEAR
+    years, within = year + minutes // MINUTES_PER_YEAR, minutes % MINUTES_PER_YEAR
     from_march = within >= MINUTES_PER_DAY * FIRST_DAY_OF_MONTH[2]
     within = within + MINUTES_PER_DAY * (_is_leap_year(years) & from_march)
     new_year = (years - 1970).astype("datetime64[Y]").astype("datetime64[ms]")

@@ -20,7 +20,7 @@ from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
-FORMAT = "sdc-run/2"
+FORMAT = "sdc-run/3"
 """Format version of metrics.json, stored in its field ``format``."""
 VECTOR_FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "asimd", "sve")
 """Linux names of the vector extensions for which libraries have special code."""
@@ -66,13 +66,17 @@ def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
                 "name": config.name,
                 "location": location,
                 "start": config.site.start,
+                "year": int(year),
+                "utc_offset_h": float(utc_offset_h),
                 "synthetic": synthetic,
                 "provenance": sources,
                 "sha256": {kind: hashes[path] for kind, path in _input_files(config).items()},
             }
-            for config, location, synthetic, sources in zip(
+            for config, location, year, utc_offset_h, synthetic, sources in zip(
                 sim.fleet.configs,
                 locations(sim.fleet.configs),
+                drivers.year,
+                drivers.utc_offset_h,
                 drivers.synthetic,
                 drivers.sources,
                 strict=True,

@@ -20,9 +20,11 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, config_from_dict, load_json, load_yaml
 from sdc_taichi.errors import ConfigError, SdcError, shortened
+from sdc_taichi.exogenous.year_clock import UTC_OFFSETS_H, YEARS
 from sdc_taichi.run.description import FORMAT
 from sdc_taichi.run.folder_writer import METRICS_FILE
-from sdc_taichi.run.steps_file import AIR_KEY, METADATA_KEY, RACKS_KEY, STEPS_FILE
+from sdc_taichi.run.steps_file import AIR_KEY, KEY_COLUMNS, METADATA_KEY, RACKS_KEY, STEPS_FILE
+from sdc_taichi.run.time_column import zone
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_METRICS_BYTES, decoding, open_input, read_text
 
@@ -52,12 +54,15 @@ _DATA_CENTER_TYPES: Mapping[str, type | tuple[type, ...]] = {
     "name": str,
     "location": str,
     "start": str,
+    "year": int,
+    "utc_offset_h": (int, float),
     "synthetic": bool,
     "provenance": dict,
     "sha256": dict,
     "metrics": dict,
     "events": list,
 }
+_DATA_CENTER_RANGES = {"year": YEARS, "utc_offset_h": UTC_OFFSETS_H}
 _EVENT_TYPES: Mapping[str, type | tuple[type, ...]] = {
     "kind": str,
     "start_step": int,
@@ -96,13 +101,13 @@ class FleetSteps:
     """Fleet totals of a run by step, and hottest inlets of B data centers by interval."""
 
     series: pd.DataFrame
-    """One row per step. ``time`` is the time of the first data center; ``it_w``, ``overhead_w`` (W)
-    and ``carbon_g`` (g) are sums over the data centers. ``inlet_low_c``, ``inlet_mid_c``,
-    ``inlet_high_c`` and ``inlet_max_c`` (C) are the 10 %, 50 % and 90 % quantile and the maximum of
-    the data centers' hottest inlets."""
+    """One row per step. ``time`` is the local standard time of the first data center; ``it_w``,
+    ``overhead_w`` (W) and ``carbon_g`` (g) are sums over the data centers. ``inlet_low_c``,
+    ``inlet_mid_c``, ``inlet_high_c`` and ``inlet_max_c`` (C) are the 10 %, 50 % and 90 % quantile
+    and the maximum of the data centers' hottest inlets."""
     edge_times: npt.NDArray[np.datetime64]
-    """Start times of m intervals, and the end of the run, (m + 1,); all intervals but the last have
-    equal length."""
+    """Start times of m intervals, and the end of the run, (m + 1,), local standard time of the
+    first data center; all intervals but the last have equal length."""
     inlet_max_c: F64
     """Highest inlet temperature in each interval and data center, in C, (m, B)."""
 
@@ -128,6 +133,8 @@ def read_steps(
 ) -> list[pd.DataFrame]:
     """Read the steps of some data centers as DataFrames with ``step``, ``time`` and more columns.
 
+    ``time`` is in the time zone of the data center, its local standard time.
+
     Args:
         run: The run.
         dcs: Indices of the data centers; the result has one DataFrame for each.
@@ -145,10 +152,14 @@ def read_steps(
         for name, values in parts.items():
             values.append(group[name][:, list(dcs)])
     series = {name: np.concatenate(values) for name, values in parts.items()}
-    return [
+    frames = [
         pd.DataFrame({name: values[:, i] for name, values in series.items()})
         for i in range(len(dcs))
     ]
+    for dc, frame in zip(dcs, frames, strict=True):
+        local = zone(run.metrics["data_centers"][dc]["utc_offset_h"])
+        frame["time"] = frame["time"].dt.tz_localize("UTC").dt.tz_convert(local)
+    return frames
 
 
 def read_fleet_steps(run: RunFolder) -> FleetSteps:
@@ -162,6 +173,7 @@ def read_fleet_steps(run: RunFolder) -> FleetSteps:
     summed = ("it_w", "overhead_w", "carbon_g")
     steps, size = run.metrics["steps_done"], len(run.names)
     step_h = float(run.metrics["step_h"])
+    offset = np.timedelta64(round(60 * run.metrics["data_centers"][0]["utc_offset_h"]), "m")
     interval = next(
         (round(h / step_h) for h in _INTERVALS_H if h >= step_h and run.hours <= h * MAX_INTERVALS),
         -(-steps // MAX_INTERVALS),
@@ -172,7 +184,7 @@ def read_fleet_steps(run: RunFolder) -> FleetSteps:
     for group in _row_groups(run, (*summed, "inlet_max_c")):
         inlets = group["inlet_max_c"]
         low, mid, high = np.quantile(inlets, (0.1, 0.5, 0.9), axis=1)
-        columns = {"time": group["time"][:, 0]}
+        columns = {"time": group["time"][:, 0] + offset}
         columns |= {name: group[name].sum(axis=1) for name in summed}
         columns |= {"inlet_low_c": low, "inlet_mid_c": mid, "inlet_high_c": high}
         columns["inlet_max_c"] = inlets.max(axis=1)
@@ -291,6 +303,9 @@ def _read_metrics(path: Path) -> dict[str, Any]:
         if not isinstance(dc, dict):
             raise SdcError(f"{path}: {where} is {dc!r}; valid is an object")
         _check_fields(path, f"{where}.", dc, _DATA_CENTER_TYPES)
+        for name, (low, high) in _DATA_CENTER_RANGES.items():
+            if not low <= dc[name] <= high:
+                raise SdcError(f"{path}: {where}.{name} is {dc[name]}; valid is {low}..{high}")
         for number, event in enumerate(dc["events"]):
             place = f"{where}.events[{number}]"
             if not isinstance(event, dict):
@@ -421,7 +436,7 @@ def _column_names(run: RunFolder) -> list[str]:
     """Return the names of the quantity columns of steps.parquet."""
     with _open_parquet(run.steps_path) as file:
         names = file.schema_arrow.names
-    return [name for name in names if name not in ("dc", "step", "time")]
+    return [name for name in names if name not in KEY_COLUMNS]
 
 
 def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, npt.NDArray[Any]]]:
@@ -469,8 +484,8 @@ def _as_steps(run: RunFolder, index: int, table: pa.Table, done: int) -> dict[st
 def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
     """Convert a column of an Arrow table to an array after checking its type."""
     column = table.column(name)
-    kind = {"step": "int64", "time": "timestamp[ms]"}.get(name, "double")
-    if str(column.type) != kind or column.null_count:
+    kind = {"step": "int64", "time": "timestamp[ms, tz="}.get(name, "double")
+    if not str(column.type).startswith(kind) or column.null_count:
         raise SdcError(
             f"{path}: column {name} is {column.type} with {column.null_count} empty values; valid "
             f"is {kind} without"

@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 
 from sdc_taichi.atomic_file import AtomicFile, naming_errors
-from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.air_metrics import TIE_K, rank
+from sdc_taichi.run.time_column import time_column
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.inlet_parts import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
 from sdc_taichi.sim.simulator import Simulator
@@ -21,6 +21,8 @@ from sdc_taichi.types import F64, I64, StepResult, fields_of
 
 STEPS_FILE = "steps.parquet"
 """Name of the steps file in a run folder."""
+KEY_COLUMNS = ("dc", "step", "time", "utc_offset_h")
+"""Columns that identify a row; all others are quantities."""
 METADATA_KEY = b"sdc_taichi"
 """Metadata key of the description of the run, as JSON."""
 RACKS_KEY = b"sdc_taichi_racks"
@@ -62,7 +64,7 @@ class StepsWriter:
     """
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
-        self._fleet, self._start = sim.fleet, sim.drivers.start
+        self._fleet, self._drivers = sim.fleet, sim.drivers
         self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
         self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
         self._names: tuple[str, ...] = ()
@@ -131,13 +133,13 @@ class StepsWriter:
             return
         count, size = self._filled, self._fleet.size
         steps = np.arange(self._first_step, self._first_step + count)
-        times = step_times(self._start, steps, self._fleet.steps_per_hour)
         names = pa.array(self._fleet.names)
         dc = pa.array(np.tile(np.arange(size, dtype=np.int32), count))
         columns: dict[str, Any] = {
             "dc": pa.DictionaryArray.from_arrays(dc, names),
             "step": np.repeat(steps, size),
-            "time": times.reshape(-1),
+            "time": time_column(self._drivers, steps, self._fleet.steps_per_hour),
+            "utc_offset_h": np.tile(self._drivers.utc_offset_h, count),
         }
         for name, values in zip(self._names, self._values, strict=True):
             columns[name] = values[:count].reshape(-1)
@@ -145,7 +147,10 @@ class StepsWriter:
         with naming_errors(self._output.path):
             if self._writer is None:
                 self._writer = pq.ParquetWriter(
-                    self._output.file, group.schema, compression="zstd", use_dictionary=["dc"]
+                    self._output.file,
+                    group.schema,
+                    compression="zstd",
+                    use_dictionary=["dc", "utc_offset_h"],
                 )
             self._writer.write_table(group)
         self._filled = 0

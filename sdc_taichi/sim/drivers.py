@@ -29,7 +29,7 @@ from sdc_taichi.exogenous.series import (
     resample,
 )
 from sdc_taichi.exogenous.workload import read_workload
-from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.exogenous.year_clock import TYPICAL_YEAR, day_of_year, step_times
 from sdc_taichi.types import F64, I64, Exogenous
 
 MAX_KEPT_BYTES = 2**28
@@ -127,6 +127,11 @@ class Drivers:
     """Arriving work of a step as a share of capacity, 0..1."""
     start: I64
     """First simulated step, counted from the beginning of the year, (B,)."""
+    year: I64
+    """Calendar year of the first step in time stamps, (B,): that of the config, or else that of the
+    weather, of the carbon intensity or of the workload, or else ``TYPICAL_YEAR``."""
+    utc_offset_h: F64
+    """Local standard time minus UTC, in h, (B,)."""
     design_outdoor_c: F64
     """Design dry bulb in C, (B,): that of the weather file, or else the dry bulb exceeded in 0.4 %
     of the year."""
@@ -164,11 +169,22 @@ class Drivers:
             demand=self.demand.take(chosen).sharing_places(first),
             price_per_kwh=None if price is None else price.take(chosen).sharing_places(first),
             start=self.start[chosen],
+            year=self.year[chosen],
+            utc_offset_h=self.utc_offset_h[chosen],
             design_outdoor_c=self.design_outdoor_c[chosen],
             design_wet_bulb_c=self.design_wet_bulb_c[chosen],
             sources=tuple(self.sources[i] for i in chosen),
             synthetic=tuple(self.synthetic[i] for i in chosen),
         )
+
+    def times(self, steps: I64, steps_per_hour: int) -> npt.NDArray[np.datetime64]:
+        """Return the local standard time at which each of n steps begins, (n, B).
+
+        Args:
+            steps: Steps, counted from 0 at reset, (n,).
+            steps_per_hour: Number of steps in an hour.
+        """
+        return step_times(self.start, steps, steps_per_hour, self.year)
 
     def digest(self) -> bytes:
         """Return the SHA-256 of all series.
@@ -221,6 +237,7 @@ class InputReader:
             for c in configs
         ]
         self._days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
+        self._years = [c.site.year for c in configs]
         self._cache: OrderedDict[_SiteKey | _TraceKey, SiteData | Series] = OrderedDict()
         self._cache_bytes = 0
         self._design_c: tuple[F64, F64] | None = None
@@ -269,6 +286,13 @@ class InputReader:
             ).sharing_places(outdoor_c),
             demand=fleet_series([of_traces[key] for key in trace_keys]).sharing_places(outdoor_c),
             start=self._days * 24 * self._steps_per_hour,
+            year=np.array(
+                [
+                    _calendar_year(year, site, trace)
+                    for year, (site, trace) in zip(self._years, inputs, strict=True)
+                ]
+            ),
+            utc_offset_h=np.array([site.utc_offset_h for site, _ in inputs]),
             design_outdoor_c=self._design_c[0],
             design_wet_bulb_c=self._design_c[1],
             sources=tuple(
@@ -435,6 +459,8 @@ def drivers_from_arrays(
     return Drivers(
         **{name: fleet_series(list(value)) for name, value in rows.items()},
         start=np.zeros(size, dtype=np.int64),
+        year=np.full(size, TYPICAL_YEAR, dtype=np.int64),
+        utc_offset_h=np.zeros(size),
         design_outdoor_c=np.quantile(rows["outdoor_c"], DESIGN_QUANTILE, axis=1),
         design_wet_bulb_c=np.quantile(rows["wet_bulb_c"], DESIGN_QUANTILE, axis=1),
         sources=({"weather": source, "carbon": source, "workload": source},) * size,
@@ -506,6 +532,12 @@ def _read_site(key: _SiteKey) -> SiteData:
 
 def _read_trace(key: _TraceKey) -> Series:
     return load_trace(key.name, seed=key.seed) if key.file is None else read_workload(key.file)
+
+
+def _calendar_year(year: int | None, site: SiteData, trace: Series) -> int:
+    """Return the calendar year of the first step (``Drivers.year``)."""
+    years = (year, *(series.year for series in (site.outdoor_c, site.ci_g_per_kwh, trace)))
+    return next((each for each in years if each is not None), TYPICAL_YEAR)
 
 
 def _site_is_synthetic(site: SiteData) -> bool:

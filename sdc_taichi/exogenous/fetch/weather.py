@@ -23,6 +23,7 @@ from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.fetch.download import MOST_DOWNLOAD_BYTES, Request
 from sdc_taichi.exogenous.fetch.services import services
 from sdc_taichi.exogenous.weather_table import Place
+from sdc_taichi.exogenous.year_clock import UTC_OFFSETS_H
 from sdc_taichi.user_file import decoding
 
 MOST_OFFSET_ERROR_H = 4.0
@@ -106,7 +107,8 @@ def check_offset(utc_offset_h: float, longitude_deg: float) -> None:
         DataError: the offset is out of range, or too far from solar time.
     """
     off_h = (utc_offset_h - longitude_deg / 15.0 + 12.0) % 24.0 - 12.0
-    if not -12.0 <= utc_offset_h <= 14.0 or abs(off_h) > MOST_OFFSET_ERROR_H:
+    low, high = UTC_OFFSETS_H
+    if not low <= utc_offset_h <= high or abs(off_h) > MOST_OFFSET_ERROR_H:
         raise DataError(
             f"--utc-offset {utc_offset_h:g}: expected local standard time minus UTC in h, which is "
             f"about {longitude_deg / 15.0:+.0f} at longitude {longitude_deg:g}"
