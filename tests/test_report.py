@@ -41,7 +41,7 @@ from sdc_taichi.viz import (
     report_metrics,
     report_pictures,
 )
-from sdc_taichi.viz.plotting import format_number
+from sdc_taichi.viz.plotting import format_number, with_local_time
 
 NASTY = '<script>alert("1")</script> & $x_{$\n</style>東'
 STEPS = 2 * 96
@@ -172,8 +172,8 @@ def test_summary_says_what_ran(folder: Path, page: Page) -> None:
     hot = pd.read_parquet(
         folder / "greedy" / "steps.parquet", columns=["time", "utc_offset_h", "inlet_max_c"]
     )
-    (hottest,) = hot.iloc[[int(hot["inlet_max_c"].to_numpy().argmax())]].itertuples()
-    when = hottest.time + pd.Timedelta(hours=hottest.utc_offset_h)
+    row = int(hot["inlet_max_c"].to_numpy().argmax())
+    when = with_local_time(hot)["time"].iloc[row]
     dc = total["hottest_dc"]
     racks = next(c for c in two_halls() if c.name == dc).hall.racks_per_row
     row, rack = divmod(total["hottest_rack"], racks)
