@@ -172,8 +172,8 @@ def test_summary_says_what_ran(folder: Path, page: Page) -> None:
     hot = pd.read_parquet(
         folder / "greedy" / "steps.parquet", columns=["time", "utc_offset_h", "inlet_max_c"]
     )
-    row = int(hot["inlet_max_c"].to_numpy().argmax())
-    when = with_local_time(hot)["time"].iloc[row]
+    hottest_row = int(hot["inlet_max_c"].to_numpy().argmax())
+    when = with_local_time(hot)["time"].iloc[hottest_row]
     dc = total["hottest_dc"]
     racks = next(c for c in two_halls() if c.name == dc).hall.racks_per_row
     row, rack = divmod(total["hottest_rack"], racks)
