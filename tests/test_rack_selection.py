@@ -92,6 +92,7 @@ def test_zones_are_blocks_of_rows_that_divide_the_hall(rows: int, per_row: int) 
         highest, mean = zones.highest(inlet_c)[:, zone], zones.mean(inlet_c)[:, zone]
         np.testing.assert_array_equal(highest, inlet_c[:, chosen].max(axis=1))
         np.testing.assert_allclose(mean, inlet_c[:, chosen].mean(axis=1), rtol=1e-12)
+        np.testing.assert_array_equal(zones.of_racks(chosen), zone)
         selected = parse_racks(f"zone:{zone}")
         selected.check(hall)
         np.testing.assert_array_equal(selected.racks(hall), chosen)

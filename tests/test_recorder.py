@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -30,11 +30,22 @@ from sdc_taichi import (
 from sdc_taichi.cli.view import moment_of
 from sdc_taichi.control import View
 from sdc_taichi.hall.air_metrics import rank
+from sdc_taichi.hall.zones import hall_zones
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.sim.design_hall import solve_design_hall
+from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64, QUANTITIES, ServerLayers
-from sdc_taichi.viz import hall_rasters, plotting, recording_blocks, recording_series
+from sdc_taichi.viz import (
+    hall_rasters,
+    plotting,
+    recording_airflow,
+    recording_blocks,
+    recording_series,
+    recording_states,
+    recording_zones,
+)
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_text import failure_entries, protection_entries
 
@@ -723,3 +734,150 @@ def test_missing_rerun_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(SdcError, match="pip install rerun-sdk"):
         Recorder(tmp_path / "x.rrd")
     assert not list(tmp_path.iterdir())
+
+
+def test_states_of_racks_are_recorded_when_they_change(run: Run) -> None:
+    entity = run.recorded[f"/dc/{FOCUS[0]}/state/racks"]
+    names = [info["class_description"]["info"]["label"] for info in entity[CONTEXT][0][0]]
+    assert names == ["normal", "throttled", "tripped", "fans failed"]
+    (((form,),)) = entity["SegmentationImage:format"]
+    assert (form["height"], form["width"]) == (2, 2)
+    frames = dict(zip(entity["step"], entity["SegmentationImage:buffer"], strict=True))
+    now, states = b"", set()
+    for step, result in enumerate(run.results):
+        (now,) = map(bytes, frames.get(step, [now]))
+        expected = result.rack_status[:4].tolist()
+        if 40 <= step < 56 and expected[2] != 2:
+            expected[2] = recording_states.FANS_FAILED
+        assert list(now) == expected, step
+        states.update(expected)
+    assert states >= {0, 2, 3}
+    assert len(frames) < len(run.results) / 2
+
+
+CONTEXT = "AnnotationContext:context"
+
+
+@pytest.fixture(scope="module")
+def failing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Simulator, Any]]:
+    """A day of a hall of 12 x 18 racks, in which one of six CRAC units is down for three hours."""
+    down = "events.scheduled=[{kind: crac_down, unit: 2, start_h: 14, duration_h: 3}]"
+    path = tmp_path_factory.mktemp("failing") / "run.rrd"
+    with Simulator(load_config("hall_of_2026", [down])) as sim:
+        sim.reset()
+        with Recorder(path) as rec:
+            rec.begin(sim)
+            for _ in range(60):
+                rec.add(sim.step())
+        yield sim, read(path)
+
+
+def test_share_map_names_the_unit_that_feeds_each_rack(failing: tuple[Simulator, Any]) -> None:
+    sim, recorded = failing
+    entity = recorded["/dc/hall_of_2026/airflow/shares/units"]
+    infos = [info["class_description"]["info"] for info in entity[CONTEXT][0][0]]
+    frames = dict(zip(entity["step"], entity["SegmentationImage:buffer"], strict=True))
+    assert 56 in frames, "a frame when the unit fails"
+    seen = {step: np.frombuffer(bytes(frame), np.uint16) for step, (frame,) in frames.items()}
+    before, after = (seen[max(s for s in seen if s <= step)] for step in (55, 59))
+    inlets = Inlets(sim.fleet, 0, sim.intake_air())
+    for rack in (0, 17, 98, 215):
+        share = inlets.parts(rack).unit_share
+        low = int(share.max() * 4) * 25
+        assert f"CRAC {share.argmax()} gives" in infos[after[rack]]["label"]
+        assert f"{low} to {low + 25} %" in infos[after[rack]]["label"].replace("up to", "0 to")
+    fed = {step: np.mean((pixels - 1) // 4 == 2) for step, pixels in seen.items()}
+    assert np.mean((after - 1) // 4 == 2) < 0.5 * np.mean((before - 1) // 4 == 2)
+    assert fed[0] > 0.1
+    colours = {infos[1 + 4 * unit + 3]["color"] for unit in range(6)}
+    assert len(colours) == 6
+
+
+def test_close_ups_show_where_exhaust_comes_from(failing: tuple[Simulator, Any]) -> None:
+    sim, recorded = failing
+    path = "/dc/hall_of_2026/airflow/close_ups"
+    titles, arrows = recorded[f"{path}/titles"], recorded[f"{path}/arrows"]
+    steps = titles["step"]
+    assert steps == arrows["step"]
+    assert set(range(0, 56, 12)) | {56} <= set(steps)
+    inlets = Inlets(sim.fleet, 0, sim.intake_air())
+    hall = sim.fleet.configs[0].hall
+    close_ups = recording_airflow.CloseUps(hall)
+    for number, rack in enumerate(inlets.hottest(5)):
+        parts = inlets.parts(rack)
+        found = close_ups.arrows(number, parts)
+        sources = [*parts.sources(), (rack, parts.own_exhaust_k)]
+        np.testing.assert_allclose(found.warming_k, [k for _, k in sources])
+        image = close_ups.image([0] * number + [rack], np.arange(hall.racks, dtype=np.float32))
+        for (x, y), (source, _) in zip(found.start, sources, strict=True):
+            assert image[int(y), int(x)] == source, "an arrow begins at its source"
+        (x, _), ends = close_ups.title_place(number), found.end[:, 0]
+        assert np.all(np.abs(ends - x) < 0.5), "arrows end at the hot rack"
+    for radii, labels in zip(arrows["Arrows2D:radii"], arrows["Arrows2D:labels"], strict=True):
+        warming_k = np.array([float(label.split()[0]) for label in labels])
+        relative = warming_k / warming_k.max()
+        # Labels are rounded to 0.01 K.
+        np.testing.assert_allclose(radii / np.max(radii), relative, atol=0.02 / warming_k.max())
+        assert np.ptp(relative) > 0.2
+    (text,) = recorded["/dc/hall_of_2026/airflow/sources"]["TextDocument:text"][0]
+    assert text.count("\n") == 6
+    assert "| row " in text
+
+
+def test_arrows_from_racks_beyond_a_close_up_begin_at_its_edge() -> None:
+    inlets = solve_design_hall(load_config("large")).inlets
+    parts = inlets.parts(500)
+    far = np.zeros(1000)
+    far[[0, 999]] = 2.0, 1.0
+    close_ups = recording_airflow.CloseUps(load_config("large").hall)
+    found = close_ups.arrows(0, replace(parts, exhaust_k=far))
+    assert found.warming_k.tolist() == [2.0, 1.0]
+    height, width = close_ups.image_shape
+    assert np.all(found.start >= -1.0)
+    assert np.all(found.start <= [width, height + 1.0])
+
+
+def test_racks_of_changed_zones_are_recorded_within_a_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = [
+        "hall.rows=42", "hall.racks_per_row=50", "hvac.crac.units=8",
+        "events.scheduled=[{kind: crac_down, unit: 3, start_h: 3, duration_h: 3}]",
+    ]  # fmt: skip
+    monkeypatch.setattr(recording_zones, "MOST_RACKS_PER_STEP", 400)
+    path = tmp_path / "zones.rrd"
+    with Simulator(load_config("large", values)) as sim, Recorder(path) as rec:
+        sim.reset()
+        rec.begin(sim)
+        results = []
+        for _ in range(20):
+            results.append(sim.step())
+            rec.add(results[-1])
+    recorded = read(path)
+    hall, zones = sim.fleet.configs[0].hall, hall_zones(sim.fleet.configs[0].hall)
+    assert zones.count > 10
+    plain = recorded["/dc/large/zones/map"]
+    assert plain["step"] == list(range(20))
+    shown_c = images(plain)
+    for step, result in enumerate(results):
+        for zone, (x, y) in enumerate(recording_zones.zone_pixels(zones)):
+            racks = zones.racks(zone)
+            inside, edge = shown_c[step, int(y), int(x)], shown_c[step, int(y - 2.9), int(x)]
+            assert abs(inside - result.rack_inlet_c[racks].mean()) < 0.051
+            assert abs(edge - result.rack_inlet_max_c[racks].max()) < 0.051
+    labels = [label for (label,) in recorded["/dc/large/zones/hottest"]["Points2D:labels"]]
+    for label, result in zip(labels, results, strict=True):
+        rack = int(result.rack_inlet_max_c.argmax())
+        assert label.endswith(f"C, row {rack // hall.racks_per_row}, rack {rack}")
+    recorded_racks = np.zeros(20, np.int64)
+    for zone in range(zones.count):
+        entity = recorded[f"/dc/large/zone_racks/{zone}"]
+        entity[CONTEXT] = recorded["/dc/large/zone_racks"][CONTEXT]
+        racks = zones.racks(zone)
+        for step, pixels in zip(entity["step"], images(entity), strict=True):
+            recorded_racks[step] += len(racks)
+            found = pixels.reshape(-1)
+            np.testing.assert_allclose(found, results[step].rack_inlet_max_c[racks], atol=0.051)
+    assert recorded_racks[0] == hall.racks
+    assert 0 < recorded_racks[1:].max() <= 400
+    assert recorded_racks[12] > 0, "the unit that fails warms its zones"

@@ -206,6 +206,10 @@ class BlockBuilder:
         """True if the current block has reached its size limit and must be written."""
         return self.steps >= MAX_BLOCK_STEPS or self._bytes >= MAX_BLOCK_BYTES
 
+    def active_events(self, dc: int) -> list[ActiveEvent]:
+        """Return the events of a data center in focus that are active in the latest step."""
+        return [event for event in self._active if event.dc == dc]
+
     def add(self, result: StepResult, rewards: Mapping[str, F64] | None) -> None:
         """Add a step to the current block.
 

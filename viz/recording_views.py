@@ -66,6 +66,10 @@ class FocusTab(NamedTuple):
     """Colour scales of the heat maps, keyed by quantity."""
     image_shape: tuple[int, int]
     """Height and width of the heat maps, in pixels."""
+    has_airflow: bool
+    """True if the recording has the airflow of the hall."""
+    zones: int
+    """Number of zones of the hall; 0 if the recording has none."""
 
 
 def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Blueprint:
@@ -107,7 +111,9 @@ def _fleet_tab() -> Any:
 def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
     """Return the tab of a data center: maps, 3D hall and log on the left, plots on the right."""
     maps = rrb.Tabs(
-        *(_heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()), active_tab=0
+        *(_heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()),
+        _state_view(tab),
+        active_tab=0,
     )
     events = rrb.TextLogView(
         origin=f"{tab.path}/events",
@@ -128,7 +134,7 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
 
 
 def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
-    """Return the plots of a data center in four tabs: overview, racks, cooling and work."""
+    """Return tabs of a data center: plots in overview, racks, cooling and work, airflow, zones."""
 
     def plots(*entities: str) -> list[Any]:
         return [_series_view(tab, entity) for entity in entities]
@@ -167,7 +173,46 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
         grid_columns=2,
         name="work",
     )
-    return rrb.Tabs(overview, racks, cooling, work, active_tab=0)
+    airflow = [_airflow_view(tab)] if tab.has_airflow else []
+    zones = [_zones_view(tab)] if tab.zones else []
+    return rrb.Tabs(overview, racks, *airflow, *zones, cooling, work, active_tab=0)
+
+
+def _airflow_view(tab: FocusTab) -> Any:
+    """Return the views of the share map and of the sources of exhaust."""
+    shares = _rack_map(
+        tab,
+        f"{tab.path}/airflow/shares",
+        "CRAC unit that gives most of the supply air, stronger colour for a larger share",
+        ("racks",),
+    )
+    close_ups = rrb.Spatial2DView(
+        origin=f"{tab.path}/airflow/close_ups",
+        name="exhaust that warms the five hottest racks, from the back of racks to their front",
+    )
+    sources = rrb.TextDocumentView(
+        origin=f"{tab.path}/airflow/sources", name="parts of their inlets"
+    )
+    return rrb.Vertical(shares, close_ups, sources, row_shares=[4, 4, 3], name="airflow")
+
+
+def _zones_view(tab: FocusTab) -> Any:
+    """Return the map of zones, and tabs with the racks of all zones and of each zone."""
+    zones = rrb.Spatial2DView(
+        origin=f"{tab.path}/zones", name="zones: edge the hottest inlet, middle the mean [C]"
+    )
+    title = "all zones: hottest inlet of each rack [C]"
+    whole = _rack_map(tab, f"{tab.path}/zone_racks", title, ("racks", "crac", "down"))
+    single = [
+        rrb.Spatial2DView(
+            origin=f"{tab.path}/zone_racks/{zone}",
+            contents=["$origin", f"+ {tab.path}/map/racks"],
+            name=f"zone {zone}",
+        )
+        for zone in range(tab.zones)
+    ]
+    racks = rrb.Tabs(whole, *single, active_tab=0)
+    return rrb.Vertical(zones, racks, row_shares=[1, 1], name="zones")
 
 
 def _series_view(tab: FocusTab, entity: str) -> Any:
@@ -190,21 +235,43 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
         name=f"{MAP_TITLES[quantity]}, {scale.low:g} to {scale.high:g} {scale.unit}",
         visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
     )
+    title = f"{MAP_TITLES[quantity]} [{scale.unit}]"
+    marks = "racks", "crac", "down", "hottest"
+    image = _rack_map(tab, f"{tab.path}/map/{quantity}", title, marks)
+    return rrb.Vertical(image, bar, row_shares=[5, 2], name=quantity)
+
+
+def _state_view(tab: FocusTab) -> Any:
+    """Return the view of the states of racks, with its legend below."""
+    legend = rrb.Spatial2DView(
+        origin=f"{tab.path}/legend/state",
+        name="states",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-30, 210), y_range=(-12, 24)),
+    )
+    states = _rack_map(tab, f"{tab.path}/state", "state of the racks", ("racks", "crac", "down"))
+    return rrb.Vertical(states, legend, row_shares=[5, 2], name="state")
+
+
+def _rack_map(tab: FocusTab, origin: str, name: str, marks: Sequence[str]) -> Any:
+    """Return the view of a map of racks.
+
+    Args:
+        tab: the tab.
+        origin: path of the map.
+        name: title of the view.
+        marks: entities that are shown with the map. With ``racks``, a pointer on the map names the
+            rack, from the map of names behind it.
+    """
     height, width = tab.image_shape
     edge = 0.06 * max(height, width)
-    image = rrb.Spatial2DView(
-        origin=f"{tab.path}/map/{quantity}",
-        # A pointer on the map names the rack, from the map of names behind it.
-        contents=[
-            "$origin/**",
-            *(f"+ {tab.path}/map/{mark}" for mark in ("racks", "crac", "down", "hottest")),
-        ],
-        name=f"{MAP_TITLES[quantity]} [{scale.unit}]",
+    return rrb.Spatial2DView(
+        origin=origin,
+        contents=["$origin/**", *(f"+ {tab.path}/map/{mark}" for mark in marks)],
+        name=name,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-edge, width + edge), y_range=(-edge, height + edge)
         ),
     )
-    return rrb.Vertical(image, bar, row_shares=[5, 2], name=quantity)
 
 
 def _hall_view(tab: FocusTab) -> Any:

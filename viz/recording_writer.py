@@ -5,6 +5,9 @@ A recording has these entities, where NAME is the name of a data center in focus
     dc/NAME/map/{inlet,outlet,...}     heat maps, a tile per rack
     dc/NAME/map/{hottest,down,crac}    marks on the maps: hottest rack, CRAC units
     dc/NAME/racks/..., row/...         trends of racks, and the hottest row by time
+    dc/NAME/state/racks                states of racks
+    dc/NAME/airflow/...                share map of CRAC units, and sources of exhaust
+    dc/NAME/zones/..., zone_racks/...  zones of a large hall, and the racks of each zone
     dc/NAME/hall/{inlet,outlet}        3D hall, a voxel per rack and level
     dc/NAME/series/..., crac/...       series, each entity with lines of one unit
     dc/NAME/actions/...                commands, as states
@@ -20,8 +23,9 @@ the first data center in focus.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +40,9 @@ from . import colour_scales
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, InletRange
 from .rack_histories import RackHistory
-from .recording_blocks import Block, BlockBuilder, choose_cadence
+from .recording_airflow import AirflowPictures
+from .recording_blocks import MAX_BLOCK_BYTES, Block, BlockBuilder, choose_cadence
+from .recording_frames import Pictures
 from .recording_output import RecordingOutput
 from .recording_racks import (
     TRENDS,
@@ -54,8 +60,10 @@ from .recording_series import (
     PLOTS,
     QUEUE_ENTITY,
     REWARDS_ENTITY,
+    Cadence,
     line_factors,
 )
+from .recording_states import StatePictures
 from .recording_text import ConditionLog, LogEntry, summary_markdown
 from .recording_views import (
     MAX_UNIT_LINES,
@@ -64,6 +72,7 @@ from .recording_views import (
     fleet_entities,
     make_blueprint,
 )
+from .recording_zones import MIN_RACKS, ZonePictures
 
 if TYPE_CHECKING:
     from sdc_taichi.hall.rack_selection import RackSelection
@@ -133,6 +142,7 @@ class RecordingWriter:
             for dc, grid in zip(focus, self._tile_grids, strict=True)
         ]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
+        self._pictures = [list(_pictures_of(sim, dc, self._cadence)) for dc in focus]
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
         """Number of steps added to the recording."""
@@ -160,10 +170,20 @@ class RecordingWriter:
         self._builder.add(result, rewards)
         for history in self._histories:
             history.add(result)
+        for dc, pictures in zip(self._focus, self._pictures, strict=True):
+            active = self._builder.active_events(dc)
+            for picture in pictures:
+                picture.add(result, active)
         self.steps_added += 1
         is_late = time.monotonic() - self._written_at_s > self._block_s
-        if is_late or self._builder.is_full:
+        if is_late or self._builder.is_full or self._picture_bytes > MAX_BLOCK_BYTES:
             self._write_block()
+
+    @property
+    def _picture_bytes(self) -> int:
+        """Size of the pictures of the current block other than heat maps, in bytes."""
+        pictures = itertools.chain.from_iterable(self._pictures)
+        return sum(picture.size_bytes for picture in pictures)
 
     def flush(self) -> None:
         """Write the steps of the current, incomplete block, and what is known of their racks."""
@@ -184,7 +204,7 @@ class RecordingWriter:
         block = self._builder.take()
         for index, log in enumerate(self._condition_logs):
             block.entries.extend(log.entries(block.steps, block.values[:, :, index]))
-        if not self._output.has_room_for(block.size_bytes):
+        if not self._output.has_room_for(block.size_bytes + self._picture_bytes):
             return
         if not self._output.is_open:
             self._scales = [self._scales_of(block, index) for index in range(len(self._focus))]
@@ -199,6 +219,10 @@ class RecordingWriter:
             self._write_states(index, path, block.steps, values)
             self._write_log(index, path, [e for e in block.entries if e.dc == dc])
             self._write_frames(block, index, path, map_times[index], hall_times[index])
+            for picture in self._pictures[index]:
+                for entity, steps, columns in picture.take(self._scales[index]):
+                    frame_times = self._times(steps)[index]
+                    self._output.add_columns(f"{path}/{entity}", frame_times, columns)
             self._write_down(index, path, [(at, units) for at, of, units in block.down if of == dc])
         self._map_steps += block.map_steps.tolist()
         self._hottest_c.append(block.values[:, FIELD_ROWS["inlet_max_c"]])
@@ -258,7 +282,14 @@ class RecordingWriter:
             plan = floor_plan(hall)
             size_m = plan.length_m, plan.width_m, hall.layout.ceiling_m
             name, path = self._names[dc], self._path(dc)
-            tabs.append(FocusTab(name, path, size_m, self._scales[index], grid.image_shape))
+            zones = [p.zones.count for p in self._pictures[index] if isinstance(p, ZonePictures)]
+            has_airflow = any(isinstance(p, AirflowPictures) for p in self._pictures[index])
+            scales_of_dc = self._scales[index]
+            tabs.append(
+                FocusTab(
+                    name, path, size_m, scales_of_dc, grid.image_shape, has_airflow, sum(zones)
+                )
+            )
         rewards = self._builder.reward_names or ()
         self._output.open(make_blueprint(tabs, has_rewards=bool(rewards)))
         names = {dc: self._names[dc] for dc in self._focus}
@@ -272,6 +303,10 @@ class RecordingWriter:
                 self._fleet, dc, self._path(dc), scales[dc], levels, rewards
             ):
                 self._output.send_static(entity, component)
+        for index, dc in enumerate(self._focus):
+            for picture in self._pictures[index]:
+                for entity, component in picture.entities(self._scales[index]):
+                    self._output.send_static(f"{self._path(dc)}/{entity}", component)
 
     def _scales_of(self, block: Block, index: int) -> dict[str, ColourScale]:
         """Return the colour scales of the maps of a data center, from the first block.
@@ -435,6 +470,15 @@ class RecordingWriter:
     def _path(self, dc: int) -> str:
         """Return the path of the entities of a data center, ``dc/NAME``."""
         return f"dc/{rr.escape_entity_path_part(self._names[dc])}"
+
+
+def _pictures_of(sim: Simulator, dc: int, cadence: Cadence) -> Iterator[Pictures]:
+    """Yield the pictures of a data center besides heat maps: states, airflow and zones."""
+    yield StatePictures(sim, dc)
+    if sim.fleet.air is not None:
+        yield AirflowPictures(sim, dc, cadence)
+    if sim.fleet.configs[dc].hall.racks > MIN_RACKS:
+        yield ZonePictures(sim, dc)
 
 
 def _low_mean_high(unit_values: F64) -> F64:

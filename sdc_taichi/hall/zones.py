@@ -16,7 +16,7 @@ from sdc_taichi.types import F64, I64, Reals
 
 RACKS_PER_ZONE = 100
 """Smallest mean number of racks of a zone, except that a hall has at least one zone."""
-MOST_ZONES = 64
+MOST_ZONES = 32
 """Largest number of zones of a hall."""
 
 
@@ -55,6 +55,13 @@ class Zones:
         per_row = int(self.first_place[-1])
         first = np.arange(rows.start, rows.stop) * per_row
         return (first[:, None] + np.arange(places.start, places.stop)).reshape(-1)
+
+    def of_racks(self, racks: I64) -> I64:
+        """Return the zones of racks, both by their index in the hall, of the same shape."""
+        row, place = np.divmod(racks, self.first_place[-1])
+        block = np.searchsorted(self.first_row, row, side="right") - 1
+        section = np.searchsorted(self.first_place, place, side="right") - 1
+        return np.asarray(block * self.shape[1] + section)
 
     def highest(self, rack_values: Reals) -> Reals:
         """Return the highest value of each zone from one value per rack, (..., R) to (..., Z)."""

@@ -223,10 +223,10 @@ class InletParts:
 
     def sources(self, most: int = LISTED_SOURCES) -> list[tuple[int, float]]:
         """Return the other racks with the largest contributions, as (rack, K), largest first."""
-        others_k = self.exhaust_k.copy()
-        others_k[self.rack] = -np.inf
-        order = np.argsort(-rank(others_k), kind="stable")[: min(most, len(others_k) - 1)]
-        return [(int(i), float(others_k[i])) for i in order if others_k[i] > 0.0]
+        others = np.flatnonzero(self.exhaust_k > 0.0)
+        others = others[others != self.rack]
+        order = np.argsort(-rank(self.exhaust_k[others]), kind="stable")[:most]
+        return [(int(rack), float(self.exhaust_k[rack])) for rack in others[order]]
 
 
 class Inlets:
@@ -246,34 +246,42 @@ class Inlets:
         offsets = fleet.group_offsets[self._first_rack : self._first_rack + self._racks + 1]
         self._group_offsets = offsets - offsets[0]
         if fleet.air is None:
-            self._shares = np.ones((self._racks, 1))
+            self._shares, self._weight = np.ones((self._racks, 1)), np.ones(1)
+            self._covered, self._covered_c = (
+                np.ones(self._racks),
+                np.full(self._racks, air.supply_c[0]),
+            )
             self._exhaust_share = air.exhaust_share
         else:
             first, end = fleet.air.unit_share_offsets[dc : dc + 2]
-            shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
-            self._shares = weighted_shares(shares, air.unit_weight)
-            excess = np.maximum(self._shares @ air.supply_ratio - 1.0, 0.0)
-            lowered = np.exp(-fleet.oversupply_decay[dc] * excess)
-            self._exhaust_share = air.exhaust_share * lowered
+            self._shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
+            weight = self._weight = air.unit_weight
+            # One product with all rows reads the shares of large halls only once.
+            rows = np.stack([np.ones(len(weight)), air.fresh_ratio, air.supply_ratio])
+            rows = np.concatenate([rows, rows[1:2] * air.supply_c]) * weight
+            total, covered, supply, covered_c = (self._shares @ rows.T).T
+            self._covered, self._covered_c = covered / total, covered_c / total
+            excess = np.maximum(supply / total - 1.0, 0.0)
+            self._exhaust_share = air.exhaust_share * np.exp(-fleet.oversupply_decay[dc] * excess)
         self._group_inlet_c = self._group_inlets()
 
     def hottest(self, most: int) -> list[int]:
         """Return the indices of the ``most`` racks with the hottest inlets, hottest first."""
-        ranked = rank(np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1]))
-        chosen = np.arange(self._racks)
-        if most < self._racks:
-            # Large halls are sorted only from the coldest of the chosen racks upwards.
+        hottest_c = np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1])
+        ranked, chosen = rank(hottest_c), np.arange(self._racks)
+        if 0 < most < self._racks:
+            # Of many racks only the hottest are sorted.
             coldest = np.partition(ranked, self._racks - most)[self._racks - most]
             chosen = np.flatnonzero(ranked >= coldest)
-        order = np.argsort(-ranked[chosen], kind="stable")
-        return [int(rack) for rack in chosen[order][:most]]
+        order = np.argsort(-ranked[chosen], kind="stable")[:most]
+        return [int(rack) for rack in chosen[order]]
 
     def main_units(self) -> tuple[I64, F64]:
         """Return the CRAC unit that gives each rack most of its supply air, and its share, (R,).
 
         Units are counted from 0 in their hall; shares are 0..1, and 0 where no unit gives air.
         """
-        return largest_shares(self._shares, self._air.fresh_ratio)
+        return largest_shares(self._shares, self._weight * self._air.fresh_ratio)
 
     def parts(self, rack: int) -> InletParts:
         """Split the inlet temperature of a rack's hottest server into parts."""
@@ -282,7 +290,7 @@ class Inlets:
         group = int(first + np.argmax(rank(self._group_inlet_c[first:end])))
         group_0 = fleet.group_offsets[self._first_rack]
         ends = fleet.server_offsets[group_0 + np.array([first, group, end])]
-        shares = self._shares[rack]
+        shares = weighted_shares(self._shares[rack, None], self._weight)[0]
         covered = shares * air.fresh_ratio
         cover = float(covered.sum())
         # If no unit supplies air, the configured shares define a nominal supply temperature.
@@ -362,8 +370,7 @@ class Inlets:
             first = self._first_rack
             rack_c = air.supply_c[0] + self._fleet.approach_k[first : first + self._racks]
             return np.asarray(np.repeat(rack_c, counts) + self._group_rows[_OFFSET_ROW])
-        covered = self._shares * air.fresh_ratio
-        fresh_k = covered @ air.supply_c - covered.sum(axis=1) * air.mixed_c
+        fresh_k = self._covered_c - self._covered * air.mixed_c
         taken = np.repeat(self._exhaust_share, counts) * self._group_rows[_HEIGHT_ROW]
         mixed_c, fresh_k = np.repeat(air.mixed_c, counts), np.repeat(fresh_k, counts)
         return np.asarray(mixed_c + (1.0 - taken) * fresh_k)
