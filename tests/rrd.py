@@ -43,8 +43,8 @@ def scalars(entity: dict[str, list[Any]]) -> npt.NDArray[np.float64]:
 
 def classes(entity: dict[str, list[Any]]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint32]]:
     """Value and colour of every class of a map or a colour bar; class 0 has no value."""
-    ((context,),) = (entity["AnnotationContext:context"],)
-    infos = [entry["class_description"]["info"] for entry in context[0]]
+    context = entity["AnnotationContext:context"][-1][0]  # the latest counts
+    infos = [entry["class_description"]["info"] for entry in context]
     assert [info["id"] for info in infos] == list(range(len(infos)))
     values = [float(info["label"].split()[0]) for info in infos[1:]]
     return np.array([np.nan, *values]), np.array([info["color"] for info in infos], np.uint32)

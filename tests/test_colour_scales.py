@@ -15,6 +15,7 @@ from sdc_taichi.viz.colour_scales import (
     difference_scale,
     inlet_scale,
     labels,
+    largest_difference_k,
     parse_inlet_range,
 )
 
@@ -66,15 +67,26 @@ def test_values_beyond_the_range_keep_their_label_and_the_colour_of_the_end() ->
     assert colours_of(scale)[0] == 0, "no value has no colour"
 
 
-@pytest.mark.parametrize("largest", [0.3, 4.2, 37.0])
+@pytest.mark.parametrize("largest", [0.3, 4.2, 12.0])
 def test_differences_are_white_at_zero_and_change_to_both_sides(largest: float) -> None:
-    scale = difference_scale(np.array([-0.5 * largest, largest]))
-    assert scale.high == -scale.low >= max(2.0, largest)
+    scale = difference_scale(largest)
+    assert scale.high == -scale.low >= max(0.5, largest)
+    assert scale.high <= max(0.5, largest + 0.5)
     below, zero, above = rgb(scale, -scale.high, 0.0, scale.high)
     assert np.ptp(zero) < 12
     assert below[2] > 2 * below[0]
     assert above[0] > 2 * above[2]
     assert labels(scale)[int(classes_of(np.array(0.0), scale)) - 1].split()[0].strip("0.") == ""
+
+
+def test_colours_of_differences_fit_all_but_the_largest() -> None:
+    scale = difference_scale(5.0)
+    differences = np.concatenate([np.full(9995, -0.2), [-3.1], np.full(4, 12.0)])
+    counts = np.bincount(classes_of(differences, scale), minlength=255)
+    assert largest_difference_k(counts, scale) == pytest.approx(0.2)
+    counts[classes_of(np.array([-3.1]), scale)] += 10_000
+    assert largest_difference_k(counts, scale) == pytest.approx(3.1)
+    assert largest_difference_k(np.zeros(255, np.int64), scale) == 0.0
 
 
 @pytest.mark.parametrize("text", ["18:32", "same"])

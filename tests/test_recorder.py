@@ -28,12 +28,13 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.cli.view import moment_of
-from sdc_taichi.control import View
+from sdc_taichi.control import View, make_controller
 from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.hall.zones import hall_zones
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64, QUANTITIES, ServerLayers
@@ -262,6 +263,79 @@ def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
 
 
 @pytest.mark.parametrize("dc", FOCUS)
+def test_changes_are_from_the_step_before_an_event(run: Run, dc: int) -> None:
+    racks = slice(*run.sim.fleet.rack_offsets[dc : dc + 2])
+    entity = run.recorded[f"/dc/{FOCUS[dc]}/map/change"]
+    assert entity["step"] == list(range(12, STEPS, 2)), "none before the first event"
+    tiles = hall_rasters.tile_grid(run.sim.fleet.configs[dc].hall)
+    shots = images(entity)[:, :: tiles.tile_height + 1, :: tiles.tile_width + 1]
+    values, _ = classes(entity)
+    befores = {12: 11, 24: 23, 40: 39, 80: 79, 92: 79, 112: 111}  # one event begins in another
+    for step, pixels in zip(entity["step"], shots, strict=True):
+        before = befores[max(begin for begin in befores if begin <= step)]
+        now_c, before_c = (run.results[at].rack_inlet_max_c[racks] for at in (step, before))
+        expected = np.clip(now_c - before_c, values[1], values[-1])
+        np.testing.assert_allclose(pixels.reshape(-1), expected, atol=0.0501)
+
+
+def test_changes_are_from_a_reference_run_at_the_same_time(tmp_path: Path) -> None:
+    def simulated(start: str, *overrides: str) -> Simulator:
+        return Simulator(load_config("tiny", [f"site.start={start}", *overrides]))
+
+    before = tmp_path / "before"
+    with simulated("03-01") as sim:
+        driver = make_controller("coldest", sim.fleet)
+        simulate_to_folder(sim, driver, RunRequest("coldest", 120), before)
+    results = []
+    path = tmp_path / "after.rrd"
+    with simulated("03-02", "servers.power_w=[120, 12]") as sim:
+        sim.reset()
+        with Recorder(path, against=before) as rec:
+            rec.begin(sim, describe_run(sim, RunRequest("idle", 40)))
+            for _ in range(40):
+                results.append(sim.step())
+                rec.add(results[-1])
+    with simulated("03-01") as sim:
+        driver = make_controller("coldest", sim.fleet)
+        reference: list[StepResult] = []
+        simulate(sim, driver, 120, on_step=reference.append)
+    (name,) = {entity.split("/")[2] for entity in read(path) if entity.startswith("/dc/")}
+    entity = read(path)[f"/dc/{name}/map/change"]
+    assert entity["step"] == list(range(24)), "while the reference lasts"
+    tiles = hall_rasters.tile_grid(load_config("tiny").hall)
+    shots = images(entity)[:, :: tiles.tile_height + 1, :: tiles.tile_width + 1]
+    for step, pixels in enumerate(shots):
+        expected = results[step].rack_inlet_max_c - reference[96 + step].rack_inlet_max_c
+        np.testing.assert_allclose(pixels.reshape(-1), expected, atol=0.056)
+    assert shots.min() > 1.0, "and differ"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "match"),
+    [
+        (
+            ["hall.rows=1", "hall.racks_per_row=4"],
+            "2 rows of 2 .* valid is a run of halls of equal",
+        ),
+        (["site.start=05-01"], "8 steps from 01-01; valid is a run at the time of the recorded"),
+        (["simulation.steps_per_hour=2"], "4 steps an hour; valid are 2"),
+    ],
+)
+def test_references_that_do_not_fit_are_refused(
+    tmp_path: Path, overrides: list[str], match: str
+) -> None:
+    before = tmp_path / "before"
+    with Simulator(load_config("tiny")) as sim:
+        simulate_to_folder(sim, make_controller("idle", sim.fleet), RunRequest("idle", 8), before)
+    rec = Recorder(tmp_path / "x.rrd", against=before)
+    with Simulator(load_config("tiny", overrides)) as sim:
+        sim.reset()
+        with pytest.raises(SdcError, match=match):
+            rec.begin(sim)
+    assert not (tmp_path / "x.rrd").exists()
+
+
+@pytest.mark.parametrize("dc", FOCUS)
 def test_maps_name_their_racks(run: Run, dc: int) -> None:
     hall = run.sim.fleet.configs[dc].hall
     entity = run.recorded[f"/dc/{FOCUS[dc]}/map/racks"]
@@ -445,7 +519,13 @@ def test_recording_explains_itself(run: Run) -> None:
         "The 3 other data centers count in the fleet series only",
     ):  # fmt: skip
         assert expected in text
-    for what, mark in (("inlet", "40 C"), ("outlet", "40 C"), ("power", "1 kW"), ("rise", "0 K")):
+    for what, mark in (
+        ("inlet", "40 C"),
+        ("outlet", "40 C"),
+        ("power", "1 kW"),
+        ("rise", "0 K"),
+        ("change", "0 K"),
+    ):
         legend = run.recorded[f"/dc/{FOCUS[0]}/legend/{what}/ticks"]
         assert mark in legend["Points2D:labels"][0]
     (limits,) = run.recorded[f"/dc/{FOCUS[0]}/legend/inlet/limits"]["Points2D:labels"]

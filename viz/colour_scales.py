@@ -16,7 +16,7 @@ from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, Reals
+from sdc_taichi.types import F64, I64, Reals
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -269,15 +269,35 @@ def power_scale(fleet: Fleet) -> ColourScale:
     return make_scale(0.0, high, "kW", [Band(0.0, high, VIRIDIS)], beyond=False)
 
 
-def difference_scale(difference_k: Reals, least_k: float = 2.0) -> ColourScale:
+def difference_scale(largest_k: float, resolution_k: float = 0.1) -> ColourScale:
     """Return a diverging colour scale of temperature differences, in K, with zero in its middle.
 
+    The classes do not depend on the range of the colours, which may thus change afterwards.
+
     Args:
-        difference_k: differences at the beginning of the run, in K, any shape.
-        least_k: smallest end of the range, in K.
+        largest_k: largest difference that the colours cover, in K, if there are classes for it;
+            rounded up to 0.5 K.
+        resolution_k: step between two classes, in K.
     """
-    end = max(least_k, float(np.ceil(np.percentile(np.abs(difference_k), 99.9))))
-    return make_scale(-end, end, "K", [Band(-end, end, DIVERGING)])
+    end = max(0.5, float(np.ceil(2.0 * largest_k - 1e-9)) / 2.0)
+    end = min(end, 126.0 * resolution_k)
+    bands = (Band(-end, end, DIVERGING),)
+    return ColourScale(-end, end, "K", bands, resolution_k, -126.0 * resolution_k)
+
+
+def largest_difference_k(counts: I64, scale: ColourScale) -> float:
+    """Return the 99.9th percentile of absolute differences, in K.
+
+    Args:
+        counts: number of values of every class of the scale, (``MAX_CLASSES`` + 1,).
+        scale: scale of differences.
+    """
+    differences_k = np.abs(values_of(scale))
+    order = np.argsort(differences_k, kind="stable")
+    total = np.cumsum(counts[1:][order])
+    if total[-1] == 0:
+        return 0.0
+    return float(differences_k[order][np.searchsorted(total, 0.999 * total[-1])])
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

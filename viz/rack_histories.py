@@ -75,6 +75,33 @@ class RackHistory:
         highest = np.maximum.reduce([numbers[0] for numbers in [*self._numbers, *self._pending]])
         return np.asarray(highest / PER_K + LOWEST_C, np.float64)
 
+    def at(self, step: int) -> RackValues | None:
+        """Return the values of all racks at a step, or the highest of the steps kept with it.
+
+        Args:
+            step: the step, counted from 0 at reset.
+
+        Returns:
+            Values at one time, (1, R) each; None if the step is not in the history.
+        """
+        self._reduce()
+        if not self._steps or not self._steps[0] <= step <= self._steps[-1]:
+            return None
+        index = (step - self._steps[0]) // self._stride
+        frames = self._numbers[index : index + 1] or self._pending
+        inlet_c, outlet_c, power = np.maximum.reduce(frames)[:, None]
+        return RackValues(
+            np.array([step]),
+            inlet_c / PER_K + LOWEST_C,
+            outlet_c / PER_K + LOWEST_C,
+            power / self._per_kw,
+        )
+
+    def inlet_c(self, step: int) -> F64 | None:
+        """Return the inlets of all racks at a step, in C, (R,); None if the history lacks it."""
+        values = self.at(step)
+        return None if values is None else values.inlet_c[0]
+
     def of_racks(self, racks: I64) -> RackValues:
         """Return the values of racks of the hall at all times.
 

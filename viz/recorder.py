@@ -58,6 +58,9 @@ class Recorder:
         inlet_range: lowest and highest inlet of the colours of the maps, in C; ``"same"`` is 10 to
             45 C, for recordings that are compared; None is the range that the halls use at the
             beginning of the run, up to their allowable limit at least.
+        against: folder of a run of the same halls, which ``begin`` simulates again; a map shows
+            inlets less those of this run at the same time of the year. None shows them less the
+            last step before an event, if there are events.
         racks: racks whose trends are recorded, such as ``"7,row:3,hottest:10,median"`` (see
             ``hall.rack_selection``); None records the ten hottest of the run and the median one.
 
@@ -74,6 +77,7 @@ class Recorder:
         serve_port: int | None = None,
         inlet_range: InletRange = None,
         racks: str | RackSelection | None = None,
+        against: str | os.PathLike[str] | None = None,
     ) -> None:
         import_rerun()
         self._file: Path | None = None
@@ -94,6 +98,7 @@ class Recorder:
             raise SdcError(f"every {every!r}: valid is a positive integer")
         self._every = every
         self._racks = parse_racks(racks, "racks") if isinstance(racks, str) else racks
+        self._against = None if against is None else Path(against)
         self._inlet_range = check_inlet_range(inlet_range)
         self._episodes = 0
         self._writer: RecordingWriter | None = None
@@ -150,6 +155,12 @@ class Recorder:
         keep_bytes = KEEP_BYTES + KEEP_BYTES_PER_VALUE * values + KEEP_BYTES_PER_DC * fleet.size
         names = distinct_names(fleet.names)
         focus = _focus_indices(names, self._focus)
+        reference = None
+        if self._against is not None:
+            from .recording_reference import simulate_reference
+
+            steps = int(description.get("steps_asked", 0))
+            reference = simulate_reference(self._against, sim, names, focus, steps)
         output = RecordingOutput(
             file=self.file,
             address=self._address,
@@ -158,7 +169,15 @@ class Recorder:
             keep_bytes=keep_bytes,
         )
         return RecordingWriter(
-            sim, names, focus, description, output, self._every, self._inlet_range
+            sim,
+            names,
+            focus,
+            description,
+            output,
+            every_steps=self._every,
+            inlet_range=self._inlet_range,
+            racks=self._racks,
+            reference=reference,
         )
 
     def add(self, result: StepResult, *, rewards: Mapping[str, F64] | None = None) -> None:

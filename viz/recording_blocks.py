@@ -36,6 +36,8 @@ from .recording_text import LogEntry, failure_entries, protection_entries
 if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
 
+    from .recording_reference import Reference
+
 MAX_BLOCK_STEPS, MAX_BLOCK_BYTES = 1_024, 16_000_000
 """Number of steps and of bytes at which the block in memory is written to the recording."""
 MAP_QUANTITIES = ("inlet", "outlet", "power", "rise")
@@ -44,6 +46,8 @@ HALL_QUANTITIES = ("inlet", "outlet")
 """Quantities of the 3D hall, in C."""
 MAP_EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0), (np.inf, 6.0))
 """Interval of heat maps in h, by the largest number of racks in focus; 0 h is every step."""
+MAPS_IN_EVENTS = 3
+"""Number of heat maps during an event in the time of one without."""
 HALL_EVERY_H, HALL_EVERY_H_IN_EVENTS = 3.0, 1.0
 """Smallest interval of frames of the 3D hall, in h, without and with an active event.
 
@@ -73,8 +77,9 @@ def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) 
     map_every_h = next(hours for most, hours in MAP_EVERY_H if racks <= most)
     per_hour = fleet.steps_per_hour
     map_every = every_steps or max(1, round(map_every_h * per_hour))
+    map_in_events = every_steps or max(1, round(map_every_h * per_hour / MAPS_IN_EVENTS))
     hall_every = every_steps or max(map_every, round(HALL_EVERY_H * per_hour))
-    in_events = every_steps or max(map_every, round(HALL_EVERY_H_IN_EVENTS * per_hour))
+    in_events = every_steps or max(map_in_events, round(HALL_EVERY_H_IN_EVENTS * per_hour))
     has_servers = fleet.servers <= MAX_SERVERS_IN_LEVELS
     is_small = racks <= rasters.MAX_RACKS_OF_SMALL_HALL
     most_levels = SMALL_HALL_LEVELS if is_small else LARGE_HALL_LEVELS
@@ -84,6 +89,7 @@ def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) 
     )
     return Cadence(
         map_every_steps=map_every,
+        map_every_steps_in_events=map_in_events,
         hall_every_steps=hall_every,
         hall_every_steps_in_events=in_events,
         levels=levels,
@@ -125,6 +131,10 @@ class Block:
     """Steps of the M heat maps, (M,)."""
     maps: dict[str, Reals]
     """Rack values of heat maps, (M, R), by quantity of ``MAP_QUANTITIES``."""
+    change_steps: I64
+    """Steps of the C maps of the difference from the reference, (C,)."""
+    changes: F32
+    """Inlet less that of the reference, in K, (C, R)."""
     hall_steps: I64
     """Steps of the H frames of the 3D hall, (H,)."""
     halls: dict[str, Reals]
@@ -142,9 +152,16 @@ class BlockBuilder:
         sim: the simulator whose results are recorded.
         focus: indices of the data centers in focus.
         cadence: how often and how finely heat maps and 3D halls are recorded.
+        reference: reference of the difference of inlets; None is the state before an event.
     """
 
-    def __init__(self, sim: Simulator, focus: Sequence[int], cadence: Cadence) -> None:
+    def __init__(
+        self,
+        sim: Simulator,
+        focus: Sequence[int],
+        cadence: Cadence,
+        reference: Reference | None = None,
+    ) -> None:
         fleet = sim.fleet
         self._sim, self._fleet = sim, fleet
         self._focus, self._cadence = list(focus), cadence
@@ -178,6 +195,12 @@ class BlockBuilder:
         self._has_events = any(
             fleet.configs[dc].events.scheduled or fleet.configs[dc].events.sampled for dc in focus
         )
+        self.has_reference = reference is not None or self._has_events
+        """True if there are maps of the difference from a reference."""
+        self._reference = reference
+        self._before_event_c: Reals | None = None
+        self._before_first_event_c: Reals | None = None
+        self._last_inlet_c: Reals | None = None
         self._active: list[ActiveEvent] = []
         self.first_event: ActiveEvent | None = None
         """First event of a data center in focus; None before it."""
@@ -191,6 +214,8 @@ class BlockBuilder:
         self._reduced: list[tuple[F64, ...]] = []
         self._map_steps: list[int] = []
         self._maps: list[F32] = []
+        self._change_steps: list[int] = []
+        self._changes: list[F32] = []
         self._hall_steps: list[int] = []
         self._halls: list[F32] = []
         self._entries: list[LogEntry] = []
@@ -239,7 +264,8 @@ class BlockBuilder:
         self._bytes += 8 * len(FIELDS) * (len(self._focus) + 2)
         self._add_events(result)
         cadence = self._cadence
-        if step % cadence.map_every_steps == 0:
+        map_every = cadence.map_every_steps_in_events if self._active else cadence.map_every_steps
+        if step % map_every == 0:
             self._add_map(result)
         every = cadence.hall_every_steps_in_events if self._active else cadence.hall_every_steps
         if step % every == 0:
@@ -266,6 +292,8 @@ class BlockBuilder:
             rewards=np.stack(rewards, axis=1) if rewards else None,
             map_steps=np.array(self._map_steps, dtype=np.int64),
             maps=_by_quantity(MAP_QUANTITIES, maps),
+            change_steps=np.array(self._change_steps, dtype=np.int64),
+            changes=np.array(self._changes[: len(self._change_steps)], dtype=np.float32),
             hall_steps=np.array(self._hall_steps, dtype=np.int64),
             halls=_by_quantity(HALL_QUANTITIES, halls),
             entries=self._entries,
@@ -336,9 +364,14 @@ class BlockBuilder:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
             self._entries += failure_entries(step, self._active, active, fleet)
             self._add_units_down(step, active)
-            self._active = active
+            if active and not self._active and self._last_inlet_c is not None:
+                self._before_event_c = self._last_inlet_c[self._pick_racks]
+                if self._before_first_event_c is None:
+                    self._before_first_event_c = self._before_event_c
+            self._last_inlet_c = result.rack_inlet_max_c
             if active and self.first_event is None:
                 self.first_event = active[0]
+            self._active = active
         if status == self._last_status:
             return
         after = result.rack_status
@@ -372,7 +405,23 @@ class BlockBuilder:
         rise_k = inlet_c - result.supply_c.astype(np.float32)[self._dc_of_racks]
         self._maps.append(np.stack([inlet_c, outlet_c, (cpu_w + fan_w) * np.float32(1e-3), rise_k]))
         self._bytes += self._map_bytes
+        reference_c = self.reference_c(result.step)
+        if reference_c is not None:
+            self._changes.append((inlet_c - reference_c).astype(np.float32))
+            self._change_steps.append(result.step)
         self._map_steps.append(result.step)
+
+    def reference_c(self, step: int) -> Reals | None:
+        """Return the inlets with which those of a step compare, in C, (R,); None without any.
+
+        Args:
+            step: the last step that was added, or a step during the first event.
+        """
+        if self._reference is not None:
+            return self._reference.inlet_c(step)
+        if self.first_event is not None and step < self.first_event.end_step:
+            return self._before_first_event_c
+        return self._before_event_c
 
     def _add_hall(self, result: StepResult) -> None:
         """Store the level temperatures of the 3D halls of a step."""

@@ -26,6 +26,8 @@ class Cadence:
 
     map_every_steps: int
     """Steps between two heat maps."""
+    map_every_steps_in_events: int
+    """Steps between two heat maps while a failure or weather event lasts."""
     hall_every_steps: int
     """Steps between two frames of the 3D hall."""
     hall_every_steps_in_events: int

@@ -289,6 +289,7 @@ def summary_markdown(
     focus: Mapping[int, str],
     scales: Mapping[int, Mapping[str, ColourScale]],
     cadence: Cadence,
+    reference: str,
 ) -> str:
     """Return a Markdown text about the run and its inputs, and about how to read the recording.
 
@@ -298,12 +299,15 @@ def summary_markdown(
         focus: name in the recording of each data center in focus, keyed by its index.
         scales: colour scales of the heat maps by quantity, of each data center in focus.
         cadence: how often and how finely heat maps and 3D halls are recorded.
+        reference: name of the reference of the map of changes.
     """
     # Ranges are the same in all data centers in focus.
-    of_maps = next(iter(scales.values())).items()
+    of_first = next(iter(scales.values()))
+    of_maps = [(name, scale) for name, scale in of_first.items() if scale.unit != "K"]
     ranges = ", ".join(f"{name} {s.low:g} to {s.high:g} {s.unit}" for name, s in of_maps)
     resolution = ", ".join(f"{name} {s.resolution:.4g} {s.unit}" for name, s in of_maps)
     map_every = _steps_text(cadence.map_every_steps)
+    map_in_events = _steps_text(cadence.map_every_steps_in_events)
     hall_every = _steps_text(cadence.hall_every_steps)
     in_events = _steps_text(cadence.hall_every_steps_in_events)
     lines = [
@@ -312,14 +316,16 @@ def summary_markdown(
         f"{_count_text(fleet.servers, 'server')}; a step is {60 // fleet.steps_per_hour} minutes. "
         "Times are the start of the step, local standard time of the data center.",
         "",
-        f"Series have every step, heat maps every {map_every}, the 3D hall every {hall_every}, "
-        f"while an event lasts every {in_events}. There the front of a rack shows the hottest "
-        f"inlet {_levels_text(cadence)}, in the colours of the maps; aisles are rounded to half a "
-        "rack's depth.",
+        f"Series have every step, heat maps every {map_every} (while an event lasts every "
+        f"{map_in_events}), the 3D hall every {hall_every} (every {in_events}). There the front of "
+        f"a rack shows the hottest inlet {_levels_text(cadence)}, in the colours of the maps; "
+        "aisles are rounded to half a rack's depth.",
         "",
         f"Colours cover: {ranges}; values beyond are drawn in the colours of its ends. The colours "
         f"of inlets jump at {_limits_text(scales, focus)}. Resolution: {resolution}. A pointer on "
         "a map names rack and value.",
+        "",
+        f"The map of changes shows inlets less those of: {reference}." * ("change" in of_first),
         "",
         _INPUTS_TEXTS[description.get("synthetic")],
         "",

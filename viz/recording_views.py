@@ -40,6 +40,7 @@ MAX_UNIT_LINES = 24
 
 MAP_TITLES = {
     "inlet": "rack inlet",
+    "change": "rack inlet less reference",
     "rise": "rack inlet less supply air",
     "outlet": "rack outlet",
     "power": "rack power",
@@ -110,10 +111,11 @@ def _fleet_tab() -> Any:
 
 def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
     """Return the tab of a data center: maps, 3D hall and log on the left, plots on the right."""
-    maps = rrb.Tabs(
-        *(_heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()),
-        _state_view(tab),
-        active_tab=0,
+    maps = {quantity: _heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()}
+    differences = [maps.pop(name) for name in ("change", "rise") if name in maps]
+    both = rrb.Horizontal(
+        rrb.Tabs(*maps.values(), _state_view(tab), active_tab=0),
+        rrb.Tabs(*differences, active_tab=0),
     )
     events = rrb.TextLogView(
         origin=f"{tab.path}/events",
@@ -124,11 +126,11 @@ def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
             text_log_columns=["loglevel", "body"],
         ),
     )
-    hall = rrb.Vertical(maps, _hall_view(tab), events, row_shares=[5, 4, 2])
+    hall = rrb.Vertical(both, _hall_view(tab), events, row_shares=[5, 4, 2])
     return rrb.Horizontal(
         hall,
         _plot_tabs(tab, has_rewards=has_rewards),
-        column_shares=[4, 5],
+        column_shares=[1, 1],
         name=tab.name,
     )
 
@@ -232,7 +234,7 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
     """Return the view of a heat map of racks, with its colour bar below."""
     bar = rrb.Spatial2DView(
         origin=f"{tab.path}/legend/{quantity}",
-        name=f"{MAP_TITLES[quantity]}, {scale.low:g} to {scale.high:g} {scale.unit}",
+        name=f"colours of {MAP_TITLES[quantity]} [{scale.unit}]",
         visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
     )
     title = f"{MAP_TITLES[quantity]} [{scale.unit}]"
@@ -385,10 +387,9 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
         image_format = rr.components.ImageFormat(
             width=width, height=height, color_model="L", channel_datatype="U8"
         )
-        yield f"{path}/map/{quantity}", annotation_context(scale)
         image = rr.SegmentationImage.from_fields(format=image_format, opacity=1.0)
         yield f"{path}/map/{quantity}", image
-        yield from _colour_bar(f"{path}/legend/{quantity}", scale)
+        yield from scale_entities(path, quantity, scale)
     per_row = hall.racks_per_row
     if hall.racks <= rasters.MAX_NAMED_RACKS:
         names = [rack_place(rack, per_row) for rack in range(hall.racks)]
@@ -402,6 +403,18 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
     yield f"{path}/map/racks", rr.AnnotationContext(invisible)
     numbers = rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0)
     yield f"{path}/map/racks", numbers
+
+
+def scale_entities(path: str, quantity: str, scale: ColourScale) -> Entities:
+    """Yield the static entities of the colours of a map: its classes, and its colour bar.
+
+    Args:
+        path: path of the data center in the recording.
+        quantity: quantity of the map.
+        scale: colour scale of the map.
+    """
+    yield f"{path}/map/{quantity}", annotation_context(scale)
+    yield from _colour_bar(f"{path}/legend/{quantity}", scale)
 
 
 def _hall_entities(

@@ -34,7 +34,7 @@ import rerun as rr
 
 from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c, rank
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.types import F64, I64, Reals, StepResult
 
 from . import colour_scales
 from . import hall_rasters as rasters
@@ -71,12 +71,15 @@ from .recording_views import (
     data_center_entities,
     fleet_entities,
     make_blueprint,
+    scale_entities,
 )
 from .recording_zones import MIN_RACKS, ZonePictures
 
 if TYPE_CHECKING:
     from sdc_taichi.hall.rack_selection import RackSelection
     from sdc_taichi.sim.simulator import Simulator
+
+    from .recording_reference import Reference
 
 LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
 """Longest time between two blocks, in s of real time: of a live recording, and of a file."""
@@ -100,6 +103,7 @@ class RecordingWriter:
             from the number of racks in focus.
         inlet_range: range of the colours of inlets, see ``colour_scales.inlet_scale``.
         racks: racks whose trends are recorded; None records the default ones.
+        reference: reference of the difference of inlets; None is the state before an event.
 
     Raises:
         ConfigError: a hall does not have the racks, or they are too many.
@@ -112,9 +116,11 @@ class RecordingWriter:
         focus: Sequence[int],
         description: Mapping[str, Any],
         output: RecordingOutput,
-        every_steps: int | None,
+        *,
+        every_steps: int | None = None,
         inlet_range: InletRange = None,
         racks: RackSelection | None = None,
+        reference: Reference | None = None,
     ) -> None:
         fleet = sim.fleet
         self._selections = [
@@ -122,13 +128,22 @@ class RecordingWriter:
         ]
         self._histories = [RackHistory(fleet, dc) for dc in focus]
         self._map_steps: list[int] = []
+        self._difference_counts: dict[str, I64] = {
+            quantity: np.zeros(colour_scales.MAX_CLASSES + 1, np.int64)
+            for quantity in ("rise", "change")
+        }
+        """Number of values of every class in the maps of differences."""
+        self._first_step = 0
         self._hottest_c: list[F64] = []
         """Hottest inlet of each data center in focus, in C, (T, n) of each block."""
         self._fleet, self._description, self._output = fleet, description, output
         self._names, self._focus = names, focus
         self._drivers = sim.drivers.take(focus)
         self._cadence = choose_cadence(fleet, focus, every_steps)
-        self._builder = BlockBuilder(sim, focus, self._cadence)
+        self._builder = BlockBuilder(sim, focus, self._cadence, reference)
+        self._reference_name = (
+            "the last step before an event" if reference is None else reference.name
+        )
         self._rows_and_factors = {
             entity: ([FIELD_ROWS[f] for _, f, _ in plot.lines], line_factors(plot, sim.step_h))
             for entity, plot in PLOTS.items()
@@ -207,6 +222,7 @@ class RecordingWriter:
         if not self._output.has_room_for(block.size_bytes + self._picture_bytes):
             return
         if not self._output.is_open:
+            self._first_step = int(block.steps[0])
             self._scales = [self._scales_of(block, index) for index in range(len(self._focus))]
             self._open()
         times, map_times, hall_times = map(
@@ -249,20 +265,50 @@ class RecordingWriter:
                 steps = np.array(self._map_steps)
                 cursor = row.cursor_columns(steps)
                 self._output.add_columns(f"{path}/row/cursor", self._times(steps)[index], cursor)
+        for quantity, counts in self._difference_counts.items():
+            self._fit_colours(quantity, counts)
         self._write_moment()
         self._output.send_block()
 
+    def _fit_colours(self, quantity: str, counts: I64) -> None:
+        """Fit the colours of a map of differences to the differences of the run so far."""
+        for index, dc in enumerate(self._focus):
+            if quantity in self._scales[index]:
+                before = self._scales[index][quantity]
+                largest_k = colour_scales.largest_difference_k(counts, before)
+                scale = colour_scales.difference_scale(largest_k, before.resolution)
+                self._scales[index][quantity] = scale
+                for entity, component in scale_entities(self._path(dc), quantity, scale):
+                    self._output.send_static(entity, component)
+
     def _write_moment(self) -> None:
-        """Write the time that a viewer shows first, and log the hottest inlet of each hall."""
+        """Write the time that a viewer shows first, and the maps of that time."""
         hottest_c = rank(np.concatenate(self._hottest_c))
-        first = self.steps_added - len(hottest_c)
-        begin, end = 0, len(hottest_c)
+        first, begin, end = self._first_step, 0, len(hottest_c)
         event = self._builder.first_event
         if event is not None:
             begin, end = max(0, event.start_step - first), min(end, event.end_step - first)
         step = first + begin + int(hottest_c[begin:end].max(axis=1).argmax())
+        if step not in self._map_steps:
+            self._write_maps_at(step)
         moment = str(self._clock(np.array([step]))[0, 0].astype("datetime64[s]"))
         self._output.send_static(MOMENT_ENTITY, rr.TextDocument(moment))
+
+    def _write_maps_at(self, step: int) -> None:
+        """Write the heat maps of the inlets of a step, from the histories of the racks."""
+        for index, (dc, history) in enumerate(zip(self._focus, self._histories, strict=True)):
+            inlet_c = history.inlet_c(step)
+            if inlet_c is None:
+                continue
+            path, times = self._path(dc), self._times(np.array([step]))[index]
+            self._write_map(f"{path}/map/inlet", times, inlet_c[None], index, "inlet")
+            hall = self._fleet.configs[dc].hall
+            mark = mark_columns(inlet_c[None], hall, self._tile_grids[index])
+            self._output.add_columns(f"{path}/map/hottest", times, mark)
+            reference_c = self._builder.reference_c(step)
+            if reference_c is not None:
+                change_k = inlet_c - reference_c[self._builder.racks[index]]
+                self._write_map(f"{path}/map/change", times, change_k[None], index, "change")
 
     def _write_down(
         self, index: int, path: str, changes: list[tuple[int, tuple[int, ...]]]
@@ -294,7 +340,9 @@ class RecordingWriter:
         self._output.open(make_blueprint(tabs, has_rewards=bool(rewards)))
         names = {dc: self._names[dc] for dc in self._focus}
         scales = dict(zip(self._focus, self._scales, strict=True))
-        text = summary_markdown(self._description, self._fleet, names, scales, self._cadence)
+        text = summary_markdown(
+            self._description, self._fleet, names, scales, self._cadence, self._reference_name
+        )
         self._output.send_static("summary", rr.TextDocument(text, media_type="text/markdown"))
         for entity, component in fleet_entities():
             self._output.send_static(entity, component)
@@ -329,12 +377,17 @@ class RecordingWriter:
             (limits_c[index], max(limits_c)),
             classes[index] or USUAL_CLASS,
         )
-        return {
+        rise_k = float(np.percentile(np.abs(first["rise"]), 99.9))
+        resolution_k = 0.1 if rise_k < 9.0 else 0.5
+        scales = {
             "inlet": inlets,
-            "rise": colour_scales.difference_scale(first["rise"]),
+            "rise": colour_scales.difference_scale(rise_k, resolution_k),
             "outlet": colour_scales.outlet_scale(self._inlet_range, first["outlet"]),
             "power": colour_scales.power_scale(self._fleet),
         }
+        if self._builder.has_reference:
+            scales["change"] = colour_scales.difference_scale(5.0)
+        return scales
 
     def _write_fleet(self, block: Block, times: list[rr.TimeColumn]) -> None:
         """Write the series of the whole fleet."""
@@ -434,10 +487,11 @@ class RecordingWriter:
         racks, levels = self._builder.racks[index], self._builder.levels[index]
         scales, grid = self._scales[index], self._tile_grids[index]
         for quantity, values in block.maps.items():
-            classes = colour_scales.classes_of(values[:, racks], scales[quantity])
-            frames = rasters.heat_maps(classes, grid)
-            columns = rr.SegmentationImage.columns(buffer=frames.reshape(len(frames), -1))
-            self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
+            self._write_map(f"{path}/map/{quantity}", map_times, values[:, racks], index, quantity)
+        if len(block.change_steps):
+            times = self._times(block.change_steps)[index]
+            changes = block.changes[:, racks]
+            self._write_map(f"{path}/map/change", times, changes, index, "change")
         if len(block.map_steps):
             hall = self._fleet.configs[self._focus[index]].hall
             mark = mark_columns(block.maps["inlet"][:, racks], hall, grid)
@@ -448,6 +502,26 @@ class RecordingWriter:
             columns = rr.VoxelGridMap.columns(colors=voxels.reshape(-1))
             parts = columns.partition(np.full(len(voxels), voxels.shape[1]))
             self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
+
+    def _write_map(
+        self, entity: str, times: list[rr.TimeColumn], values: Reals, index: int, quantity: str
+    ) -> None:
+        """Write heat maps of a quantity of a data center.
+
+        Args:
+            entity: path of the heat maps.
+            times: time columns of the heat maps.
+            values: value of each rack, (M, R).
+            index: index of the data center among those in focus.
+            quantity: name of the quantity.
+        """
+        classes = colour_scales.classes_of(values, self._scales[index][quantity])
+        if quantity in self._difference_counts:
+            counts = np.bincount(classes.reshape(-1), minlength=colour_scales.MAX_CLASSES + 1)
+            self._difference_counts[quantity] += counts
+        frames = rasters.heat_maps(classes, self._tile_grids[index])
+        columns = rr.SegmentationImage.columns(buffer=frames.reshape(len(frames), -1))
+        self._output.add_columns(entity, times, columns)
 
     def _clock(self, steps: I64) -> npt.NDArray[np.datetime64]:
         """Return the times at which T steps begin on the clocks of the n data centers in focus.

@@ -63,6 +63,14 @@ class RecordingOptions:
         int | None,
         typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
     ] = None
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Run of the same halls, simulated again; a recorded map shows inlets less those "
+            "of this run. [default: the state before an event]",
+        ),
+    ] = None
     racks: Annotated[
         str | None,
         typer.Option(
@@ -106,6 +114,7 @@ class RecordingOptions:
             only_recorded = {
                 "--focus": self.focus,
                 "--every": self.every,
+                "--against": self.against,
                 "--racks": self.racks,
                 "--inlet-range": self.inlet_range,
             }
@@ -131,6 +140,7 @@ class RecordingOptions:
             every=self.every,
             serve_port=port,
             inlet_range=inlet_range,
+            against=self.against,
             racks=None if self.racks is None else parse_racks(self.racks),
         )
 
