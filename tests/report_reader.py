@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from typing import Any
 
-VOID = {"meta", "img", "br"}
+from sdc_taichi.viz.report_html import Block, html_blocks
+
+VOID = {"meta", "img", "br", "source"}
 
 
 @dataclass
@@ -64,6 +67,10 @@ def read_page(html: str) -> Page:
     page.close()
     page.problems += [f"<{tag}> is not closed" for tag in page.open]
     return page
+
+
+def read_blocks(blocks: Sequence[Block]) -> Page:
+    return read_page(html_blocks(blocks))
 
 
 def pictures(page: Page) -> list[Any]:

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from known_optimum import KWH_VALUE, TASK_VALUE, made_up_optimum
-from report_reader import Page, read_page
+from report_reader import Page, read_blocks, read_page
 from sdc_taichi import (
     RunRequest,
     SdcError,
@@ -28,6 +28,7 @@ from sdc_taichi.cli.app import app
 from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import AchievedPath, Achievement, run_beside
+from sdc_taichi.run.comparison import compare_runs
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.run.optimum_folder import (
     FOLDER,
@@ -83,8 +84,10 @@ def page(folders: Path) -> Page:
     with pytest.MonkeyPatch.context() as patch:
         # Other sections take seconds to draw.
         for section in ("fleet_section", "data_center_section", "hot_racks_section"):
-            patch.setattr(report, section, lambda *_: "")
-        return read_page(report.report_html(runs[0], runs[1:]))
+            patch.setattr(report, section, lambda *_, **__: [])
+        return read_page(
+            report.report_html(runs[0], compare_runs(dict(zip(names, runs, strict=True))))
+        )
 
 
 def call(*arguments: object) -> Result:
@@ -255,7 +258,7 @@ def test_report_of_the_achieved_path_lists_the_controllers(folders: Path) -> Non
     known = known_optimum([best])
     assert known is not None
     assert known.run is best
-    (table,) = read_page(optimum_section(best, known, [])).tables
+    (table,) = read_blocks(optimum_section(best, known, [])).tables
     assert table[0][-1] == "g36, share (%)"
 
 

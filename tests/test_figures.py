@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from sdc_taichi import SdcError, Simulator, StepResult, build_fleet, load_config
+from sdc_taichi.config import HallConfig
 from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.exogenous.synthetic import synthetic_site
 from sdc_taichi.run.metrics import Metric
@@ -22,7 +23,9 @@ from sdc_taichi.viz import (
     figures,
     fleet_figures,
     plotting,
+    rack_maps,
 )
+from sdc_taichi.viz.plotting import darken
 
 DAYS = 3
 DOLLARS = "_x$_{$"
@@ -235,27 +238,73 @@ def test_battery_profile_is_the_mean_day(steps: pd.DataFrame) -> None:
     assert charge.lines[0].get_xdata()[0] == 0.25, "at the end of the step"
 
 
-def test_hot_racks_shows_hours_and_ties() -> None:
+def racks_with(hall: HallConfig, **peaks: float) -> pd.DataFrame:
+    """Racks of 24 C that were never above 27 C, except those named ``rack_N``."""
+    peak_c, above_h = np.full(hall.racks, 24.0), np.zeros(hall.racks)
+    for name, value in peaks.items():
+        peak_c[int(name[5:])] = value
+        above_h[int(name[5:])] = 2.5 if value > 27.0 else 0.0
+    return pd.DataFrame({"inlet_max_c": peak_c, "above_27_h": above_h})
+
+
+def cells(axes: Any) -> Any:
+    return np.ma.filled(axes.collections[0].get_array(), 0.0).ravel()
+
+
+def test_inlet_map_shows_limits_and_ties() -> None:
     hall = load_config("corrected").hall
-    hours = np.zeros(hall.racks)
-    hours[[1, 3, 7]] = 2.5, 2.5, 0.25
-    peak = np.full(hall.racks, 24.0)
-    peak[[1, 3]] = 27.2, 27.19999
-    racks = pd.DataFrame({"hottest_h": hours, "inlet_max_c": peak})
-    figure: Any = dashboards.hot_racks(racks, hall, "ny")
-    axes = figure.axes[0]
-    shown = np.ma.filled(axes.collections[0].get_array(), 0.0).ravel()
-    np.testing.assert_array_equal(shown, hours)
-    texts = [text.get_text() for text in axes.texts]
-    assert texts == ["2.5 h\nto 27.2 °C", "2.5 h\nto 27.2 °C", "0.25 h\nto 24.0 °C"]
-    row, rack = divmod(1, hall.racks_per_row)
-    title = axes.get_title(loc="left")
-    assert title == f"ny: hottest inlet 27.2 °C, row {row} rack {rack} and 1 more"
+    racks = racks_with(hall, rack_1=27.2, rack_3=27.19999, rack_4=36.0)
+    figure: Any = rack_maps.inlet_map({"": racks}, hall, 35.0)
+    axes, bar = figure.axes
+    np.testing.assert_array_equal(cells(axes), racks["inlet_max_c"])
+    assert [text.get_text() for text in axes.texts][:5] == ["24.0", "27.2", "24.0", "27.2", "36.0"]
+    row, rack = divmod(4, hall.racks_per_row)
+    assert axes.get_title(loc="left") == (
+        f"hottest inlet 36.0 °C, 9.0 K above the recommended 27 °C, at row {row} rack {rack}"
+    )
+    ticks = [text.get_text() for text in bar.get_yticklabels()]
+    assert ticks[-2:] == ["27 recommended", "35 allowable"]
+    mesh = axes.collections[0]
+    cool, warm, _, violet = mesh.cmap(mesh.norm([26.9, 27.1, 34.9, 35.1]))
+    assert cool[1] > cool[0], "green"
+    assert warm[0] > warm[2] + 0.2, "yellow"
+    assert violet[2] > violet[1] + 0.2
     with pytest.raises(SdcError, match=r"19 rows; valid is one for each of 20 racks"):
-        dashboards.hot_racks(racks[1:], hall)
-    with pytest.raises(SdcError, match="missing columns hottest_h"):
-        dashboards.hot_racks(racks[["inlet_max_c"]], hall)
+        rack_maps.inlet_map({"": racks[1:]}, hall, 35.0)
+    with pytest.raises(SdcError, match="missing columns above_27_h"):
+        rack_maps.hours_map({"": racks[["inlet_max_c"]]}, hall)
     assert render(figure).std() > 5
+
+
+def test_variants_share_the_colours_of_rack_maps() -> None:
+    hall = load_config("corrected").hall
+    runs = {"before": racks_with(hall), "after_$": racks_with(hall, rack_7=28.4)}
+    figure: Any = rack_maps.inlet_map(runs, hall, 32.0)
+    first, second, _ = figure.axes
+    assert first.collections[0].get_clim() == second.collections[0].get_clim() == (24.0, 29.0)
+    assert first.get_title(loc="left").startswith("before: hottest inlet 24.0 °C, 3.0 K below")
+    hours: Any = rack_maps.hours_map(runs, hall)
+    before, after, _ = hours.axes
+    assert before.get_title(loc="left").startswith("before: 0 of 20 racks")
+    np.testing.assert_array_equal(cells(after), runs["after_$"]["above_27_h"])
+    assert [text.get_text() for text in after.texts if text.get_text() != "--"] == ["2.5"]
+    assert render(hours).std() > 5
+
+
+def test_dark_pages_exchange_ink_and_paper_alone() -> None:
+    hall = load_config("corrected").hall
+    figure: Any = rack_maps.inlet_map({"": racks_with(hall, rack_2=29.0)}, hall, 35.0)
+    light = render(figure).astype(int)
+    darken(figure)
+    dark = render(figure).astype(int)
+    assert light[0, 0].min() == 255
+    assert dark[0, 0, :3].max() < 40
+    coloured = np.ptp(light[..., :3], axis=2) > 90
+    assert coloured.sum() > 1000
+    np.testing.assert_array_equal(dark[coloured], light[coloured])
+    ink = (light[..., :3].max(axis=2) < 40) & (np.arange(len(light)) < 20)[:, None]
+    assert ink.any()
+    assert dark[ink][:, :3].min() > 150, "the title is light"
 
 
 def fleet_of(steps: pd.DataFrame) -> pd.DataFrame:

@@ -26,6 +26,7 @@ from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
 from sdc_taichi.viz.report import hot_racks_section
+from sdc_taichi.viz.report_html import html_blocks
 
 FAILURES = (
     "hvac.crac.units=4",
@@ -174,7 +175,7 @@ def test_a_run_that_does_not_repeat_is_an_error(run: RunFolder, tmp_path: Path) 
 
 
 def test_report_explains_the_five_hottest_racks(run: RunFolder) -> None:
-    text = hot_racks_section(run, [0, 1])
+    text = html_blocks(hot_racks_section(run, [0, 1]))
     found = hottest_inlets(run, 1)
     assert found is not None
     for rack in found.inlets.hottest(5):
@@ -187,7 +188,7 @@ def test_given_inlets_are_explained_by_their_approach_temperatures(tmp_path: Pat
     with Simulator(load_config("tiny")) as sim:
         controller = make_controller("idle", sim.fleet)
         simulate_to_folder(sim, controller, RunRequest("idle", 2, 1), tmp_path / "run")
-    report = hot_racks_section(read_run(tmp_path / "run"), [0])
+    report = html_blocks(hot_racks_section(read_run(tmp_path / "run"), [0]))
     assert "approach temperature (K)" in report
     assert "exhaust of other racks" not in report
     assert "is exhaust air" not in report

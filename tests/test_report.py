@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner, Result
 
-from report_reader import Page, pictures, read_page
+from report_reader import Page, pictures, read_blocks, read_page
 from sdc_taichi import (
     DataCenterConfig,
     SdcError,
@@ -29,13 +30,12 @@ from sdc_taichi import (
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import make_controller
 from sdc_taichi.hall.air_metrics import TIE_K
-from sdc_taichi.run import folder_reader
+from sdc_taichi.run import comparison, folder_reader
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.run.steps_file import AIR_KEY, METADATA_KEY, RACKS_KEY
 from sdc_taichi.viz import (
-    dashboards,
     report,
     report_html,
     report_metrics,
@@ -45,6 +45,7 @@ from sdc_taichi.viz.plotting import format_number, with_local_time
 
 NASTY = '<script>alert("1")</script> & $x_{$\n</style>東'
 STEPS = 2 * 96
+HALL = ("name=hall", "site.start=07-01")
 
 
 def call(*arguments: object) -> Result:
@@ -121,9 +122,9 @@ def test_page_is_whole_and_needs_nothing_else(html: str, page: Page) -> None:
 
 
 def test_pictures_are_in_the_page(page: Page) -> None:
-    # Radar, two of the fleet, five of each data center, four of the inputs.
+    # Bars, rack maps of each data center, two of the fleet, two of each data center, four inputs.
     images = pictures(page)
-    assert len(images) == 1 + 2 + 2 * 5 + 4
+    assert len(images) == 1 + 2 + 2 + 2 * 2 + 4
     for image in images:
         assert len(image.convert("RGB").getcolors(1 << 20)) > 30
 
@@ -131,7 +132,8 @@ def test_pictures_are_in_the_page(page: Page) -> None:
 def test_names_are_text(html: str, page: Page) -> None:
     line = " ".join(NASTY.split())
     assert f"Data center {line}" in page.text
-    assert f"Run of ny, {line} under" in page.text
+    assert f"ny, {line}: idle against greedy" in page.text
+    assert f"Data center {line} of greedy" in page.text
     assert "<script" not in html
     assert html.count("</style>") == 1
 
@@ -161,11 +163,13 @@ def test_summary_says_what_ran(folder: Path, page: Page) -> None:
     assert "2 data centers, 2 days from 28 February 00:00 to 2 March 00:00" in page.text
     (row,) = page.rows("fingerprint of configs, inputs and precision")
     assert row[1] == about["fingerprint"]
-    assert page.rows("controller") == [["controller", "load=greedy-ci,battery=greedy-ci"]]
+    assert page.rows("controller")[-1] == ["controller", "load=greedy-ci,battery=greedy-ci"]
     assert "taichi" in page.rows("versions")[0][1]
     assert "Inputs are SYNTHETIC" in page.text
     for kind in ("weather", "carbon", "workload"):
-        for row in page.rows(kind):
+        rows = [row for row in page.rows(kind) if "a year" not in row[1] + row[2]]
+        assert rows
+        for row in rows:
             assert "synthetic year, seed 10" in row[1]
             assert row[2] == "–"
     total = about["total"]
@@ -206,7 +210,7 @@ def many_events(run: folder_reader.RunFolder) -> folder_reader.RunFolder:
 
 
 def test_of_many_events_the_first_are_listed(folder: Path) -> None:
-    page = read_page(report.events_section(many_events(read_run(folder / "greedy"))))
+    page = read_blocks(report.events_section(many_events(read_run(folder / "greedy"))))
     ((_, first, *others),) = page.tables
     assert first == ["ny", "crac down", "1", "", "1 March 06:00", "0.5", "120 to 121"]
     assert len(others) == report_html.MAX_ROWS - 1
@@ -225,23 +229,133 @@ def test_runs_are_compared(folder: Path, page: Page) -> None:
         for name in ("greedy", "idle")
     )
     change = 100 * (theirs["cfp_kg"] / ours["cfp_kg"] - 1)
-    label = "carbon footprint"
-    expected = [format_number(t["cfp_kg"]) for t in (ours, theirs)]
-    assert [label, "kg CO₂e", expected[0], f"{expected[1]} ({change:+.2f} %)"] in page.rows(label)
-    (radar,) = [str(i["alt"]) for i in page.all("img") if "Radar" in str(i["alt"])]
-    assert f"carbon footprint {max(expected)} kg CO₂e" in radar
-    assert "Other configs" not in page.text, "both have the same inputs"
+    a_year = 8760 / 48 / 1000
+    saving, row = page.rows("carbon")[:2]
+    assert row[:3] == ["carbon", "t CO₂e a year", format_number(ours["cfp_kg"] * a_year)]
+    assert row[3] == f"{format_number(theirs['cfp_kg'] * a_year)} ({change:+.1f} %)"
+    saved = (ours["cfp_kg"] - theirs["cfp_kg"]) * a_year
+    assert saving[2] == f"{format_number(saved)} ({-change:z.1f} %)"
+    assert page.rows("controller")[0][1:] == ["load=greedy-ci,battery=greedy-ci", "idle"]
+    assert "The runs cover 2 days. Figures a year are those of the runs times 182.5" in page.text
+    assert "Money is at the example prices" in page.text
+    assert not page.rows("simple payback")
 
 
-def test_runs_of_other_configs_say_so(folder: Path, tmp_path: Path) -> None:
-    colder = [c.model_copy(update={"name": f"x{i}"}) for i, c in enumerate(two_halls())]
-    simulate(tmp_path / "colder", colder, STEPS)
-    page = read_page(
-        report_metrics.comparison_section(
-            [read_run(folder / "idle"), read_run(tmp_path / "colder")]
-        )
+def comparison_of(*words: object, **options: Any) -> comparison.Comparison:
+    return comparison.compare_runs(comparison.named_runs([*map(str, words)]), **options)
+
+
+@pytest.fixture(scope="module")
+def variants(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hall as it is, with warmer air, and with warmer air at other prices."""
+    out = tmp_path_factory.mktemp("variants")
+    warmer = ["hvac.setpoint.initial_c=22", *HALL]
+    simulate(out / "today", [load_config("corrected", [*HALL])], 30)
+    simulate(out / "warmer", [load_config("corrected", warmer)], 30)
+    free = [*warmer, "tariff.price_per_kwh=0", "tariff.demand_charge_per_kw=0"]
+    simulate(out / "free", [load_config("corrected", free)], 30)
+    turned = ["hall.rows=5", "hall.racks_per_row=4", *HALL]
+    simulate(out / "other", [load_config("corrected", turned)], 30)
+    return out
+
+
+def test_comparison_says_what_differs_and_when_it_pays(variants: Path) -> None:
+    found = comparison_of(
+        f"as is={variants / 'today'}", variants / "warmer", costs={"warmer": 1000.0}
     )
-    assert "Other configs, inputs or precision than idle (idle): idle (colder)." in page.text
+    assert found.names == ["as is", "warmer"]
+    (difference,) = found.differences
+    assert difference.name == "hvac.setpoint.initial_c"
+    assert difference.meaning == "Setpoint after a reset, in C"
+    assert difference.values == ("18.0", "22.0")
+    today, warmer = (run.metrics["total"] for run in found.runs.values())
+    of = {figure.key: figure for figure in found.figures}
+    years = 30 * 0.25 / 8760
+    for key, factor in (("grid_kwh", 1e-3), ("cost", 1.0), ("water_l", 1e-3)):
+        expected = [factor * total[key] / years for total in (today, warmer)]
+        assert of[key].values == pytest.approx(expected)
+    assert of["hottest_inlet_c"].values == (today["hottest_inlet_c"], warmer["hottest_inlet_c"])
+    saved = of["cost"].savings()[1]
+    assert saved is not None
+    assert saved > 0
+    assert found.payback_years() == {"warmer": pytest.approx(1000.0 / saved)}
+    back = comparison_of(variants / "warmer", variants / "today", costs={"today": 1.0})
+    assert back.payback_years() == {"today": None}
+
+
+def test_names_of_runs_are_those_of_the_user(variants: Path, tmp_path: Path) -> None:
+    shutil.copytree(variants / "warmer", tmp_path / "a" / "run")
+    shutil.copytree(variants / "today", tmp_path / "b=c" / "run")
+    words = [tmp_path / "a" / "run", tmp_path / "b=c" / "run", f"x y={variants / 'today'}"]
+    assert comparison_of(*words).names == ["a/run", "b=c/run", "x y"]
+
+
+def test_redundancy_is_found_where_asked(variants: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    losses = [(), (0,), (1,), (0, 1)]
+    minutes = {"today": [np.nan, np.nan, 7.0, 2.0], "warmer": [np.nan] * 4}
+    studied = iter(minutes.values())
+
+    def study(_: DataCenterConfig) -> Any:
+        cases = [SimpleNamespace(units=units) for units in losses]
+        return SimpleNamespace(losses=cases, throttle_min=np.array(next(studied)))
+
+    monkeypatch.setattr(comparison, "study_failover", study)
+    found = comparison_of(variants / "today", variants / "warmer", failover=True)
+    texts = [each.text() for each in found.redundancy.values()]
+    assert texts == ["0 (throttles 7 min after one more)", "2 or more"]
+
+
+def test_compare_prints_tables_and_json(variants: Path) -> None:
+    words = ["compare", str(variants / "today"), str(variants / "warmer"), "--cost", "warmer=1000"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    for text in ("hvac.setpoint.initial_c", "electricity bill", "simple payback", "MWh a year"):
+        assert text in done.stdout
+    done = CliRunner().invoke(app, [*words, "--json"])
+    values = json.loads(done.stdout)
+    assert values["reference"] == "today"
+    assert values["payback_years"]["warmer"] > 0
+    assert values["differences"][0]["values"] == {"today": "18.0", "warmer": "22.0"}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["today"], "1 run to compare; valid are 2 to 12"),
+        (["today", "other"], "hall has 5 x 4 racks, hall of .*today 4 x 5; runs to compare must"),
+        (["today", "free", "--cost", "free=1"], "the run 'free' has no prices"),
+        (["today", "warmer", "--cost", "wamer=1"], "'wamer' is no run; valid are 'warmer'; did"),
+        (["today", "warmer", "--cost", "today=1"], "'today' is the run that the others"),
+        (["today", "warmer", "--cost", "warmer=x"], "'x'; valid is an amount"),
+        (["today", "warmer", "--cost", "warmer=1", "--cost", "warmer=2"], "a second cost"),
+        (["x=today", "x=warmer"], "a second run 'x'"),
+        (["today", "today"], "is given twice"),
+    ],
+)
+def test_runs_that_cannot_be_compared(
+    variants: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
+) -> None:
+    monkeypatch.chdir(variants)
+    for command in ("compare", "report"):
+        if command == "report" and words == ["today"]:
+            continue
+        done = CliRunner().invoke(app, [command, *words])
+        assert done.exit_code == 2, done.output
+        assert re.search(message, done.stderr), done.stderr
+        assert done.stderr.count("\n") == 1
+        assert not list(variants.glob("*/report.html"))
+
+
+def test_report_of_variants_is_about_the_hall(variants: Path) -> None:
+    found = comparison_of(variants / "today", variants / "warmer")
+    page = read_page(report.report_html(found.runs["today"], found))
+    assert page.problems == []
+    assert page.texts[page.texts.index("hall: warmer against today")]
+    assert "idle" not in page.text.partition("Provenance")[0].replace("controller idle", "")
+    assert "tasks" not in page.text.rpartition("Inputs")[0].partition("Inputs")[0]
+    assert any("Bars of energy" in str(image["alt"]) for image in page.all("img"))
+    assert not any("Radar" in str(image["alt"]) for image in page.all("img"))
+    assert len(report.report_html(found.runs["today"], found)) < 1_500_000
 
 
 def test_runs_of_other_length_are_refused(folder: Path, tmp_path: Path) -> None:
@@ -254,7 +368,7 @@ def test_runs_of_other_length_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_interrupted_run_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report_pictures, "_data_center_pictures", lambda *_: "")
+    monkeypatch.setattr(report_pictures, "_data_center_pictures", lambda *_: [])
     simulate(tmp_path / "cut", [load_config("tiny")], 960, done=30)
     (tmp_path / "cut" / "report.html").write_text("older")
     done = call(tmp_path / "cut")
@@ -269,17 +383,12 @@ def test_interrupted_run_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_equal_runs_give_equal_bytes(folder: Path, html: str) -> None:
     run = read_run(folder / "greedy")
-    dc = report_pictures.shown_data_centers(run)[0]
     for text in (
         report.summary_section(run),
         report_metrics.metrics_section(run),
         report_pictures.fleet_section(run),
     ):
-        assert text in html
-    drawn = report_html.picture_element(
-        dashboards.hot_racks(dc.racks, dc.config.hall, "ny"), "", ""
-    )
-    assert re.findall(r'src="[^"]+"', drawn)[0] in html
+        assert report_html.html_blocks(text) in html
 
 
 def test_alike_racks_are_equally_long_the_hottest(tmp_path: Path) -> None:
@@ -302,6 +411,8 @@ def test_alike_racks_are_equally_long_the_hottest(tmp_path: Path) -> None:
         hottest = own_c >= highest_c[:, [dc]] - TIE_K
         np.testing.assert_array_equal(racks["hottest_h"], 0.25 * hottest.sum(axis=0))
         np.testing.assert_allclose(racks["inlet_max_c"], own_c.max(axis=0), atol=6e-4)
+        np.testing.assert_array_equal(racks["above_27_h"], 0.25 * (own_c > 27.0).sum(axis=0))
+        assert 0.0 < racks["above_27_h"].max() < 10.0
         assert np.count_nonzero(racks["hottest_h"] == racks["hottest_h"].max()) > 1
         by_one = np.bincount([int(step[dc]) for step in seen["hottest_rack"]], minlength=len(racks))
         assert np.all(racks["hottest_h"] >= 0.25 * by_one)
@@ -322,10 +433,10 @@ def test_files_are_named_with_their_hashes(folder: Path) -> None:
     for dc in run.metrics["data_centers"]:
         dc["provenance"]["weather"] = "LGA.epw"
         dc["sha256"] = {"weather": digest, "recirculation": digest}
-    page = read_page(report.provenance_section(run))
+    page = read_blocks(report.provenance_section(run))
     assert page.rows("weather") == [["weather", "LGA.epw", digest, f"ny, {NASTY}"]]
     assert page.rows("recirculation")[0][2] == digest
-    assert "SYNTHETIC" not in read_page(report.summary_section(run)).text
+    assert report.input_notes(run) == []
 
 
 @pytest.fixture(scope="module")
@@ -342,7 +453,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_large_fleet_shows_extremes(fleet: Path) -> None:
     run = read_run(fleet)
-    page = read_page(report_metrics.metrics_section(run))
+    page = read_blocks(report_metrics.metrics_section(run))
     by_pue = sorted(run.metrics["data_centers"], key=lambda dc: dc["metrics"]["pue"])
     worst, best = by_pue[-1], by_pue[0]
     (row,) = page.rows("PUE")
@@ -363,15 +474,15 @@ def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPat
     run = read_run(fleet)
     drawn = []
 
-    def draw(_: object, dc: Any, __: object) -> str:
+    def draw(_: object, dc: Any, *__: object) -> list[report_html.Block]:
         drawn.append(dc.index)
-        return ""
+        return []
 
     monkeypatch.setattr(report_pictures, "_data_center_pictures", draw)
     html = report.report_html(run)
     page = read_page(html)
     assert page.problems == []
-    assert "Run of 60 data centers under idle" in page.text
+    assert "60 data centers" in page.text
     sections = re.findall(r"Data center ([a-z0-9-]+)</h2>", html)
     assert sections == [run.names[index] for index in drawn]
     assert 2 <= len(sections) <= report_pictures.MAX_SHOWN_DCS
@@ -464,6 +575,11 @@ def edit_stored(folder: Path, key: bytes, content: object) -> None:
     edit_steps(folder, lambda t: t.replace_schema_metadata({**t.schema.metadata, **stored}))
 
 
+def rack_values(**values: object) -> dict[str, object]:
+    """Statistics of a hall of one rack."""
+    return {"hottest_steps": [1], "inlet_max_c": [25.0], "above_27_steps": [0], **values}
+
+
 def flip(path: Path) -> None:
     """Damage the pages of the columns that are read last, not the footer."""
     data = bytearray(path.read_bytes())
@@ -521,7 +637,11 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "racks without numbers": (
         lambda f: edit_stored(f, RACKS_KEY, [{"hottest_steps": ["x"], "inlet_max_c": None}] * 2),
-        r"steps\.parquet: sdc_taichi_racks\[0\] is .*; valid are hottest_steps, 0\.\.",
+        r"steps\.parquet: sdc_taichi_racks\[0\] is .*; valid are hottest_steps and above_27_st",
+    ),
+    "longer above 27 C than the run": (
+        lambda f: edit_stored(f, RACKS_KEY, [rack_values(above_27_steps=[STEPS + 1])] * 2),
+        r"steps\.parquet: sdc_taichi_racks\[0\] is .*; valid are hottest_steps and above_27",
     ),
     "air of fewer data centers": (
         lambda f: edit_stored(f, AIR_KEY, [{}]),

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C, rank
 from sdc_taichi.types import F64
@@ -24,7 +23,6 @@ from .plotting import (
     DAY,
     GREEN,
     GREY,
-    MAX_LABELLED_RACKS,
     ORANGE,
     PINK,
     RED,
@@ -32,14 +30,11 @@ from .plotting import (
     add_title,
     check_steps,
     date_text,
-    draw_rack_grid,
     draw_steps,
     format_day_axis,
     format_time_axis,
     is_over_a_year,
-    literal_text,
     new_figure,
-    outline_hottest,
     remove_frame,
     rows_of_day,
     scale_thousands,
@@ -83,8 +78,10 @@ Values of the column are multiplied by the factor to get the unit of the label.
 
 ENERGY_COLUMNS = ("it_kwh", "hvac_kwh", "carbon_g")
 """Columns that ``year`` sums by month or day and shows as bars."""
-MAX_SCATTER_POINTS = 6_000
+MAX_SCATTER_POINTS = 3_000
 """Largest number of points in a scatter plot; longer runs show a random sample of their steps."""
+MAX_DAYS_BY_STEP = 62
+"""Largest number of days whose single steps ``year`` draws; longer runs show hourly means."""
 MAX_NAMED_BARS = 13
 """Largest number of labelled bars; with more bars, only every second, third, ... has a label."""
 EVENT_SHADES = {
@@ -261,50 +258,6 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
     return figure
 
 
-def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
-    """Draw how many hours each rack had the hottest inlet of the hall, and its peak inlet.
-
-    Racks within ``TIE_K`` of the hottest inlet all count as hottest.
-
-    Args:
-        racks: one row per rack of the data center, as ``read_racks`` returns them.
-        hall: the hall of the data center.
-        title: text above the figure, such as the name of the data center.
-
-    Raises:
-        SdcError: matplotlib or a column is missing, or the number of rows is not that of racks.
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    figure = new_figure(9.6, 4.2)
-    missing = [name for name in ("hottest_h", "inlet_max_c") if name not in racks.columns]
-    if missing:
-        raise SdcError(f"racks: missing columns {', '.join(missing)}")
-    if len(racks) != hall.racks:
-        raise SdcError(f"racks: {len(racks)} rows; valid is one for each of {hall.racks} racks")
-    shape = (hall.rows, hall.racks_per_row)
-    hours, peak = racks["hottest_h"].to_numpy(), racks["inlet_max_c"].to_numpy()
-    axes = figure.subplots()
-    grid = hours.reshape(shape)
-    image = draw_rack_grid(
-        axes, np.ma.masked_equal(grid, 0.0), "viridis", (0.0, float(hours.max()))
-    )
-    axes.set_facecolor("#EEEEEE")
-    if hall.racks <= MAX_LABELLED_RACKS:
-        for rack in np.flatnonzero(hours):
-            row, column = divmod(int(rack), hall.racks_per_row)
-            ink = "black" if hours[rack] > 0.6 * hours.max() else "white"
-            text = f"{hours[rack]:,.4g} h\nto {peak[rack]:.1f} °C"
-            axes.text(column + 0.5, row + 0.5, text, color=ink, ha="center", va="center",
-                      fontsize=9)  # fmt: skip
-    where = outline_hottest(axes, peak.reshape(shape))
-    lead = f"{literal_text(title)}: " if title else ""
-    axes.set_title(f"{lead}hottest inlet {peak.max():.1f} °C, {where}", fontsize=10, loc="left")
-    ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
-    figure.colorbar(image, ax=axes, label="time with the hottest inlet (h)", ticks=ticks)
-    return figure
-
-
 def _draw_day_temperatures(
     axes: Axes, steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> None:
@@ -369,7 +322,8 @@ def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
 def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: str) -> None:
     """Draw a heat map with one column per day and one row per time of day.
 
-    Times without a step stay white.
+    Times without a step stay white. Runs of more than ``MAX_DAYS_BY_STEP`` days show means over an
+    hour, because steps would be thinner than a pixel of a printed page.
 
     Args:
         axes: axes to draw in.
@@ -388,6 +342,9 @@ def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: st
     columns = ((dates - dates[0]) / DAY).astype(np.int64)
     shown = np.full((int(DAY // interval), columns[-1] + 1), np.nan)
     shown[slots, columns] = values
+    per_hour = len(shown) // 24
+    if shown.shape[1] > MAX_DAYS_BY_STEP and per_hour > 1:
+        shown = shown.reshape(24, per_hour, -1).mean(axis=1)
     span = [float(date2num(d)) for d in (dates[0], dates[-1] + DAY)]  # type: ignore[no-untyped-call]
     image = axes.imshow(
         np.ma.masked_invalid(shown),

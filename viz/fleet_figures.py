@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
+    from sdc_taichi.run.comparison import Figure as ComparedFigure
+
 RADAR_METRICS = (
     ("cfp_kg", "carbon footprint", "kg CO₂e"),
     ("hvac_kwh", "HVAC energy", "kWh"),
@@ -104,6 +106,45 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
         text.set_verticalalignment("center" if abs(side) > 0.1 else "bottom")
     axes.spines["polar"].set_color(GREY)
     figure.legend(loc="upper right", frameon=False, title="less is better")
+    return figure
+
+
+def variant_bars(names: Sequence[str], compared: Sequence[ComparedFigure]) -> Figure:
+    """Draw figures of several runs as bars from zero, with a panel for each figure.
+
+    Args:
+        names: names of the runs, the first of which is the reference.
+        compared: the figures.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    columns = 2
+    rows = -(-len(compared) // columns)
+    figure = new_figure(11.0, rows * (0.75 + 0.28 * len(names)))
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.flat[len(compared) :]:
+        axes.remove()
+    places = np.arange(len(names))
+    for axes, each in zip(panels.flat, compared, strict=False):
+        values = np.array([np.nan if value is None else value for value in each.values])
+        colours = [GREY, *(BLUE for _ in names[1:])]
+        axes.barh(places, np.nan_to_num(values), color=colours, height=0.7)
+        base = values[0]
+        for place, value in zip(places, values, strict=True):
+            text = "unknown" if np.isnan(value) else format_number(value)
+            if place and base > 0 and np.isfinite(value):
+                text += f" ({100 * (value / base - 1):+z.1f} %)"
+            axes.annotate(text, (np.nan_to_num(value), place), xytext=(4, 0),
+                          textcoords="offset points", va="center", fontsize=9)  # fmt: skip
+        axes.set_yticks(places, [literal_text(name) for name in names])
+        axes.invert_yaxis()
+        top = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
+        axes.set_xlim(0.0, 1.45 * top or 1.0)
+        axes.set_title(f"{each.label} ({each.unit})", fontsize=10, loc="left")
+        axes.tick_params(axis="y", length=0)
+        axes.set_xticks([])
+        axes.spines[["top", "right", "bottom"]].set_visible(False)
     return figure
 
 

@@ -27,16 +27,26 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 DPI = 100
 """Default resolution of pictures, in pixels per inch."""
+LOSSY_QUALITY = 60
+"""Quality of WebP images that are encoded with losses, 0..100."""
 MAX_LABELLED_RACKS = 60
 """Largest number of racks of a hall whose racks show their values as numbers."""
 MIN_COLOUR_RANGE_K = 2.0
 """Smallest range of a colour bar of temperatures, in K; it keeps tenths of a kelvin faint."""
 MAX_NAME_LENGTH = 50
 """Largest number of characters of a name in a picture."""
+
+ON_COLOUR = "on colour"
+"""``gid`` of texts and marks on coloured cells, whose colours do not depend on the page."""
+_LIGHT_INK, _DARK_PAPER = 0.92, 0.09
+"""Greys that replace black and white on a dark page, 0..1; the paper is that of ``report.html``."""
+_LARGEST_TINT = 0.02
+"""Largest difference between the red, green and blue of a colour that counts as grey."""
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"
@@ -63,12 +73,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
-def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
+def webp(figure: Figure, dpi: int = DPI, *, colours: int | None = None) -> tuple[int, int, bytes]:
     """Encode a figure as a lossless WebP image, which has two thirds of the size of a PNG.
 
     Args:
         figure: the figure.
         dpi: resolution, in pixels per inch.
+        colours: None for a lossless image. A number, up to 256, reduces the image to so many
+            colours, or encodes it with losses of ``LOSSY_QUALITY`` if this takes less space.
 
     Returns:
         Width and height of the image in pixels, and the bytes of the WebP file.
@@ -81,9 +93,46 @@ def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
     with _without_glyph_warnings():
         canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    out = io.BytesIO()
-    picture.save(out, "WEBP", lossless=True, method=2, quality=0)
-    return (*picture.size, out.getvalue())
+    encodings = [io.BytesIO()]
+    if colours is not None:
+        encodings.append(io.BytesIO())
+        picture.save(encodings[1], "WEBP", quality=LOSSY_QUALITY, method=4)
+        picture = picture.quantize(colours, dither=Image.Dither.NONE).convert("RGB")
+    picture.save(encodings[0], "WEBP", lossless=True, method=2, quality=0)
+    return (*picture.size, min((each.getvalue() for each in encodings), key=len))
+
+
+def darken(figure: Figure) -> None:
+    """Exchange the ink and paper of a figure for those of a dark page, in place.
+
+    Greys from black to white become greys from light to dark; other colours, and artists with the
+    ``gid`` ``ON_COLOUR``, keep theirs. The layout is not computed again.
+    """
+    figure.set_layout_engine("none")
+    for artist in figure.findobj():
+        # Figures and axes give the colours of their patches, which are artists too.
+        if artist.get_gid() == ON_COLOUR or hasattr(artist, "patch"):
+            continue
+        for name in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
+            colour = getattr(artist, f"get_{name}", lambda: None)()
+            if isinstance(colour, str | tuple):
+                getattr(artist, f"set_{name}")(_on_dark(colour))
+            elif isinstance(colour, np.ndarray) and colour.shape == (1, 4):
+                getattr(artist, f"set_{name}")(_on_dark(tuple(colour[0])))
+
+
+def _on_dark(colour: Any) -> Any:
+    """Return the counterpart of a grey on dark paper; other colours are returned unchanged."""
+    from matplotlib.colors import to_rgba
+
+    try:
+        *rgb, alpha = to_rgba(colour)
+    except ValueError:  # a word such as "none", "auto" or "face"
+        return colour
+    if max(rgb) - min(rgb) > _LARGEST_TINT:
+        return colour
+    grey = _LIGHT_INK + (_DARK_PAPER - _LIGHT_INK) * rgb[0]
+    return (grey, grey, grey, alpha)
 
 
 def save_picture(figure: Figure, path: Path, *, parents: bool = False) -> None:
@@ -275,13 +324,15 @@ def draw_steps(axes: Axes, steps: pd.DataFrame, values: npt.ArrayLike, **style: 
     axes.plot(step_edges(steps), repeat_last(values), drawstyle="steps-post", **style)
 
 
-def draw_rack_grid(axes: Axes, grid: F64, cmap: str, limits: tuple[float, float]) -> QuadMesh:
+def draw_rack_grid(
+    axes: Axes, grid: F64, cmap: str | Colormap, limits: tuple[float, float]
+) -> QuadMesh:
     """Draw one coloured cell per rack, with row 0 on top and the racks of a row to the right.
 
     Args:
         axes: axes to draw in.
         grid: value of each rack, (rows, racks per row).
-        cmap: name of the colour map.
+        cmap: colour map, or its name.
         limits: values at the ends of the colour map.
     """
     image = axes.pcolormesh(
@@ -302,7 +353,7 @@ def draw_rack_grid(axes: Axes, grid: F64, cmap: str, limits: tuple[float, float]
     return image
 
 
-def outline_hottest(axes: Axes, grid: F64) -> str:
+def outline_hottest(axes: Axes, grid: F64, outlined: bool | None = None) -> str:
     """Outline the hottest racks of a small hall, or circle the first of them in a large hall.
 
     Nothing is marked if all racks are equally hot.
@@ -310,20 +361,26 @@ def outline_hottest(axes: Axes, grid: F64) -> str:
     Args:
         axes: axes in which ``draw_rack_grid`` drew the racks.
         grid: temperature of each rack, in C, (rows, racks per row).
+        outlined: True to outline, False to circle; None outlines in halls of at most
+            ``MAX_LABELLED_RACKS`` racks.
 
     Returns:
         Row and rack of the hottest rack, as text.
     """
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
 
     hottest = np.argwhere(grid >= grid.max() - TIE_K)
     row, rack = np.unravel_index(grid.argmax(), grid.shape)
     place = f"row {row} rack {rack}" + (f" and {len(hottest) - 1} more" * (len(hottest) > 1))
     if len(hottest) == grid.size > 1:
         place = "all racks alike"
-    elif grid.size <= MAX_LABELLED_RACKS:
+    elif grid.size <= MAX_LABELLED_RACKS if outlined is None else outlined:
         for y, x in hottest + 0.04:
-            axes.add_patch(Rectangle((x, y), 0.92, 0.92, fill=False, color=SKY, linewidth=2.5))
+            mark = Rectangle((x, y), 0.92, 0.92, fill=False, color="black", linewidth=1.6)
+            mark.set_path_effects([withStroke(linewidth=4.0, foreground="white")])
+            mark.set_gid(ON_COLOUR)
+            axes.add_patch(mark)
     else:
         axes.plot(rack + 0.5, row + 0.5, "o", color=SKY, markersize=12, mfc="none", mew=2.5)
     return place

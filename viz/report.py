@@ -14,31 +14,35 @@ from pathlib import Path
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.run.comparison import Comparison
 from sdc_taichi.run.folder_reader import RunFolder, read_configs
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 from sdc_taichi.run.inlets_of_run import InletsAtStep, hottest_inlets
 from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, rack_text, state_texts
 
 from .plotting import format_number
+from .report_comparison import MAX_MAPPED_DCS, comparison_section
 from .report_html import (
     DASH,
     MAX_ROWS,
+    Block,
     bullets,
     count_text,
     first_texts,
     html_page,
-    html_table,
     key_figures,
     local_time,
     metric_text,
     names_text,
     notice,
     paragraph,
+    table,
     time_span_text,
     time_text,
 )
-from .report_metrics import MAX_DC_COLUMNS, comparison_section, metrics_section
+from .report_metrics import MAX_DC_COLUMNS, has_shifted_work, metrics_section
 from .report_pictures import (
+    MAX_DETAILED_DCS,
     data_center_section,
     fleet_section,
     inputs_section,
@@ -51,13 +55,15 @@ from .report_pictures import (
 KEY_METRICS = (
     ("facility energy", "facility_kwh", "kWh"),
     ("PUE", "pue", ""),
-    ("cost, currency of the tariff", "cost", ""),
+    ("electricity bill, currency of the tariff", "cost", ""),
     ("carbon footprint", "cfp_kg", "kg CO₂e"),
     ("make-up water", "water_l", "L"),
+    ("highest power from the grid", "peak_kw", "kW"),
     ("hottest inlet", "hottest_inlet_c", "°C"),
-    ("dropped work", "dropped_tasks", "tasks"),
 )
 """Metrics at the top of the summary: label, name in metrics.json, unit."""
+NEUTRAL = "idle"
+"""Controller that keeps the configured setpoint and shifts neither work nor energy."""
 LOSSES = {
     "throttled_rack_h": "Racks were throttled for {} rack h because of hot air.",
     "tripped_rack_h": "Racks were switched off for {} rack h because of hot air.",
@@ -90,12 +96,15 @@ The inlet is the sum of the columns after it.
 """
 
 
-def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
-    """Write the report of a run.
+def write_report(
+    run: RunFolder, comparison: Comparison | None = None, out: Path | None = None
+) -> Path:
+    """Write the report of a run, or of several runs of one hall.
 
     Args:
         run: the run, from ``read_run``.
-        others: runs of the same length, to compare the run with.
+        comparison: the run beside others, of which it is the first, from ``compare_runs``; None
+            reports on the run alone.
         out: path of the file; None is ``report.html`` in the run's folder, which is replaced if it
             exists.
 
@@ -103,89 +112,130 @@ def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | N
         Path of the written file.
 
     Raises:
-        SdcError: matplotlib is missing, steps.parquet is damaged, the runs cannot be compared, or
-            the file cannot be written.
+        SdcError: matplotlib is missing, steps.parquet is damaged, or the file cannot be written.
     """
     target = run.path / REPORT_FILE if out is None else out
     # The file is opened first: an unwritable path must fail before the long computation.
     with atomic_write(target) as file:
-        file.write(report_html(run, others).encode("utf-8", "replace"))
+        file.write(report_html(run, comparison).encode("utf-8", "replace"))
     return target
 
 
-def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
-    """Return the report of a run as an HTML page.
+def report_html(run: RunFolder, comparison: Comparison | None = None) -> str:
+    """Return the report of a run, or of several runs of one hall, as an HTML page.
 
     Args:
         run: the run.
-        others: runs of the same length, to compare the run with.
+        comparison: the run beside others, of which it is the first; None for the run alone.
 
     Raises:
-        SdcError: matplotlib is missing, a file is damaged, or the runs cannot be compared.
+        SdcError: matplotlib is missing, or a file is damaged.
     """
-    sections = {
-        "Summary": summary_section(run),
-        "Metrics": metrics_section(run),
-    }
-    optimum = known_optimum([run, *others])
-    if others:
-        shares = None if optimum is None else [share_of(x, optimum) for x in (run, *others)]
-        sections["Comparison"] = comparison_section([run, *others], shares)
-    sections["Events"] = events_section(run)
+    runs = {"": run} if comparison is None else comparison.runs
+    optimum = known_optimum(list(runs.values()))
     shown = shown_data_centers(run)
+    sections: dict[str, list[Block]] = {}
+    of = ""
+    if comparison is not None:
+        shares = None if optimum is None else [share_of(each, optimum) for each in runs.values()]
+        sections["Comparison"] = comparison_section(comparison, shown, shares)
+        of = f" of {comparison.names[0]}"
+        shown = shown[:MAX_MAPPED_DCS]
+    detailed = comparison is None and len(shown) <= MAX_DETAILED_DCS
+    sections[f"Summary{of}"] = summary_section(run)
+    sections[f"Metrics{of}"] = metrics_section(run)
+    sections["Events"] = events_section(run)
     if optimum is not None:
         sections["Known optimum"] = optimum_section(run, optimum, shown)
     if len(run.names) > 1 and run.metrics["steps_done"] > 1:
         sections["All data centers"] = fleet_section(run)
     for dc in shown:
-        sections[f"Data center {run.names[dc.index]}"] = data_center_section(run, dc)
+        heading = f"Data center {run.names[dc.index]}{of}"
+        sections[heading] = data_center_section(
+            run, dc, detailed=detailed, has_maps=comparison is None
+        )
     sections["Why the hottest racks are hot"] = hot_racks_section(run, [dc.index for dc in shown])
+    inputs = input_notes(run)
     if run.metrics["steps_done"] > 1:
-        sections["Inputs"] = inputs_section(run, shown)
+        inputs += inputs_section(run, shown)
+    sections["Inputs"] = inputs
     sections["Provenance"] = provenance_section(run)
+    own_page = {heading for heading in sections if heading.startswith("Data center ")}
+    return html_page(page_title(run, comparison), _lead(run), sections, own_page)
+
+
+def page_title(run: RunFolder, comparison: Comparison | None = None) -> str:
+    """Return the title of a report: the halls, and the variants that are compared."""
     count = len(run.names)
-    names = ", ".join(run.names) if count <= MAX_DC_COLUMNS else f"{count:,} data centers"
-    title = f"Run of {names} under {run.metrics['controller']}"
-    own_page = {f"Data center {name}" for name in run.names}
-    return html_page(title, time_span_text(run), sections, own_page)
+    halls = ", ".join(run.names) if count <= MAX_DC_COLUMNS else f"{count:,} data centers"
+    if comparison is None:
+        return halls
+    first, *variants = comparison.names
+    several = variants[:-1]
+    listed = f"{', '.join(several)} and {variants[-1]}" if several else variants[0]
+    return f"{halls}: {listed} against {first}"
 
 
-def summary_section(run: RunFolder) -> str:
-    """Return the section with notices, key figures, hottest inlet, task counts and run settings."""
-    metrics, names = run.metrics, run.names
+def _lead(run: RunFolder) -> str:
+    """Return the text below the title: description, time span, controller, kind of inputs."""
+    (config,) = read_configs(run, [0])
+    parts = [config.description.rstrip(".")] if len(run.names) == 1 and config.description else []
+    parts.append(time_span_text(run))
+    if run.metrics["controller"] != NEUTRAL:
+        parts.append(f"controlled by {run.metrics['controller']}")
+    if run.metrics["synthetic"]:
+        parts.append("synthetic inputs (see Inputs)")
+    return "; ".join(parts)
+
+
+def summary_section(run: RunFolder) -> list[Block]:
+    """Return the section with key figures, hottest inlet, and what happened to the work."""
+    metrics = run.metrics
     total, done, asked = metrics["total"], metrics["steps_done"], metrics["steps_asked"]
-    notices = [f"Note: {note}" for note in first_texts(metrics["notes"])]
-    if metrics["synthetic"]:
-        notices.insert(
-            0,
-            "Inputs are SYNTHETIC, at least in part: these figures do not rest on measurements "
-            "alone (see Provenance).",
-        )
+    blocks = []
     if done < asked:
-        notices.insert(
-            0,
-            f"The run was interrupted: {done:,} of {asked:,} steps were done, and all figures "
-            "are of these.",
+        blocks.append(
+            notice(
+                f"The run was interrupted: {done:,} of {asked:,} steps were done, and all figures "
+                "are of these."
+            )
         )
+    return [
+        *blocks,
+        key_figures((k, f"{metric_text(total, key)} {unit}") for k, key, unit in KEY_METRICS),
+        bullets([_hottest_inlet_text(run), *_work_texts(run)]),
+    ]
+
+
+def input_notes(run: RunFolder) -> list[Block]:
+    """Return what a reader must know of the inputs: whether they are synthetic, and repairs."""
+    metrics = run.metrics
+    notices = []
+    if metrics["synthetic"]:
+        notices.append(
+            "Inputs are SYNTHETIC, at least in part: these figures do not rest on measurements "
+            "alone (see Provenance)."
+        )
+    notices += [f"Note: {note}" for note in first_texts(metrics["notes"])]
+    return [*map(notice, notices)]
+
+
+def _facts(run: RunFolder) -> dict[str, str]:
+    """Return with what a run can be repeated."""
+    metrics, names = run.metrics, run.names
     sites = list(dict.fromkeys(dc["location"] for dc in metrics["data_centers"]))
     length = count_text(run.hours / 24, "day")
-    facts = {
+    return {
         "data centers": f"{len(names):,}: {names_text(names)}",
         "sites": names_text(sites),
         "controller": metrics["controller"],
-        "steps": f"{done:,} of {60 * metrics['step_h']:g} min, {length}",
+        "steps": f"{metrics['steps_done']:,} of {60 * metrics['step_h']:g} min, {length}",
         "seed": f"{metrics['seed']}",
         "precision of the kernels": metrics["precision"],
         "folder": run.path.resolve().name,
         "versions": ", ".join(f"{name} {value}" for name, value in metrics["versions"].items()),
         "fingerprint of configs, inputs and precision": metrics["fingerprint"],
     }
-    return (
-        "".join(map(notice, notices))
-        + key_figures((k, f"{metric_text(total, key)} {unit}") for k, key, unit in KEY_METRICS)
-        + bullets([_hottest_inlet_text(run), *_work_texts(run)])
-        + html_table("What ran", None, list(facts.items()))
-    )
 
 
 def _hottest_inlet_text(run: RunFolder) -> str:
@@ -197,11 +247,16 @@ def _hottest_inlet_text(run: RunFolder) -> str:
     hours = run.metrics["data_centers"][dc]["metrics"]["inlet_above_27_h"]
     (config,) = read_configs(run, [dc])
     row, rack = divmod(total["hottest_rack"], config.hall.racks_per_row)
+    recommended = f"{RECOMMENDED_C[1]:g} °C, the highest recommended inlet"
+    above = (
+        f"An inlet there was above {recommended}, for {format_number(hours)} h, "
+        f"{100 * hours / run.hours:.3g} % of the time."
+        if hours
+        else f"No inlet there was above {recommended}."
+    )
     return (
         f"The hottest inlet was {metric_text(total, 'hottest_inlet_c')} °C in {where}, row {row}, "
-        f"rack {rack}, server {total['hottest_server']} from the floor, on {moment}. An inlet "
-        f"there was above {RECOMMENDED_C[1]:g} °C for {format_number(hours)} h, "
-        f"{100 * hours / run.hours:.3g} % of the time."
+        f"rack {rack}, server {total['hottest_server']} from the floor, on {moment}. {above}"
     )
 
 
@@ -220,12 +275,15 @@ def _work_texts(run: RunFolder) -> list[str]:
     texts = [
         f"Of {text['arrived_tasks']} tasks that arrived, {text['executed_tasks']} were done, "
         f"{dropped} and {text['lost_tasks']} lost with their servers; {text['queue_end_tasks']} "
-        "were queued at the end.",
-        f"The battery took {text['battery_charge_kwh']} kWh from the grid and gave "
-        f"{text['battery_discharge_kwh']} kWh back."
-        if total["battery_charge_kwh"] > 0
-        else "The battery was not charged.",
+        "were queued at the end."
+        if has_shifted_work(run)
+        else "All work was done when it arrived."
     ]
+    if total["battery_discharge_kwh"] > 0:
+        texts.append(
+            f"The battery took {text['battery_charge_kwh']} kWh from the grid and gave "
+            f"{text['battery_discharge_kwh']} kWh back."
+        )
     texts += [sentence.format(text[key]) for key, sentence in LOSSES.items() if total[key] > 0]
     if total["time_to_throttle_min"] is not None:
         minutes = text["time_to_throttle_min"]
@@ -233,7 +291,7 @@ def _work_texts(run: RunFolder) -> list[str]:
     return texts
 
 
-def events_section(run: RunFolder) -> str:
+def events_section(run: RunFolder) -> list[Block]:
     """Return the table of failures, outages and heat waves of a run, ``MAX_ROWS`` at most."""
     events = [
         (dc, event)
@@ -241,7 +299,7 @@ def events_section(run: RunFolder) -> str:
         for event in about["events"]
     ]
     if not events:
-        return paragraph("None: the run met no failure, outage or heat wave.")
+        return [paragraph("None: the run met no failure, outage or heat wave.")]
     rows = [
         (
             run.names[dc],
@@ -260,10 +318,10 @@ def events_section(run: RunFolder) -> str:
         caption += f", the first {MAX_ROWS}; all are in {METRICS_FILE}"
     heads = ("data center", "event", "unit or rack in hall", "amount",
              "from (local standard time)", "duration (h)", "steps")  # fmt: skip
-    return html_table(caption, heads, rows, numbers=(5, 6))
+    return [table(caption, heads, rows, numbers=(5, 6))]
 
 
-def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
+def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> list[Block]:
     """Return the section that explains the inlet temperatures of the hottest racks.
 
     Args:
@@ -292,11 +350,11 @@ def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
             )
             parts.append(paragraph(f"{run.names[dc]}: {text} simulates it again."))
         else:
-            parts.append(_hot_racks(run, dc, inlets))
-    return "".join(parts)
+            parts += _hot_racks(run, dc, inlets)
+    return parts
 
 
-def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
+def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> list[Block]:
     """Return the table of the hottest racks of a data center, and a text about the hottest rack.
 
     Args:
@@ -318,7 +376,7 @@ def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
         texts.insert(0, f"Of the intake of the hottest, {share} is exhaust air.")
     rows = [_rack_cells(parts, hall.racks_per_row, recirculates=recirculates) for parts in racks]
     numbers = range(1, len(heads) - recirculates)
-    return html_table(caption, heads, rows, numbers=numbers) + bullets(texts)
+    return [table(caption, heads, rows, numbers=numbers), bullets(texts)]
 
 
 def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) -> list[str]:
@@ -342,8 +400,8 @@ def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) ->
     return cells
 
 
-def provenance_section(run: RunFolder) -> str:
-    """Return the table of input sources, file hashes, and the data centers that use each source."""
+def provenance_section(run: RunFolder) -> list[Block]:
+    """Return the tables of input sources with their files' hashes, and of the run's settings."""
     users: dict[tuple[str, str, str], list[str]] = {}
     for dc in run.metrics["data_centers"]:
         sources, hashes = dc["provenance"], dc["sha256"]
@@ -358,4 +416,7 @@ def provenance_section(run: RunFolder) -> str:
     if len(rows) > MAX_ROWS:
         caption += f", the first {MAX_ROWS}, all are in {METRICS_FILE}"
     heads = ("input", "source", "SHA-256 of the file", "data centers")
-    return html_table(caption, heads, rows[:MAX_ROWS])
+    return [
+        table(caption, heads, rows[:MAX_ROWS]),
+        table("What ran", None, list(_facts(run).items())),
+    ]

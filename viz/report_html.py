@@ -1,15 +1,15 @@
-"""HTML elements of reports, and texts for numbers, names and times in them.
+"""Blocks of reports, and texts for numbers, names and times in them.
 
-Most HTML comes from the Jinja template ``report.html``, which escapes every text.
+All HTML comes from the Jinja template ``report.html``, which escapes every text.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,13 +20,17 @@ from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR, day_of_year, step_ti
 from sdc_taichi.run.folder_reader import RunFolder
 from sdc_taichi.run.folder_writer import METRICS_FILE
 
-from .plotting import date_text, format_number, webp
+from .plotting import darken, date_text, format_number, webp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PICTURE_DPI = 110
-"""Resolution of pictures in reports, in pixels per inch."""
+"""Highest resolution of pictures in reports, in pixels per inch."""
+MAX_WIDTH_PX = 1216
+"""Largest width of a picture in a report, in pixels; it is the width of the page on a screen."""
+COLOURS = 256
+"""Number of colours of a picture, which keeps reports small; it is enough for colour maps."""
 LONG_WORD = 24
 """Smallest length of words in a table, such as hashes, that may be broken when printed."""
 DASH = "–"
@@ -35,6 +39,16 @@ MAX_ROWS = 40
 """Largest number of rows of tables and lists of events, sources and notes."""
 NAMES_PER_CELL = 6
 """Largest number of data centers named in a table cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Part of a section of a report, such as a table, without HTML."""
+
+    macro: str
+    """Macro of the template ``report.html`` that renders the block."""
+    content: Mapping[str, Any]
+    """Arguments of the macro; it escapes all texts."""
 
 
 @cache
@@ -53,40 +67,60 @@ def _macros() -> Any:
     return templates.get_template("report.html").module
 
 
-def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[str]) -> str:
+def html_page(
+    title: str, lead: str, sections: Mapping[str, Sequence[Block]], own_page: set[str]
+) -> str:
     """Return the complete HTML page of a report.
 
     Args:
         title: title and main heading of the page.
         lead: text below the main heading.
-        sections: HTML of each section, keyed by its heading.
+        sections: blocks of each section, keyed by its heading.
         own_page: headings of the sections that begin a new page when printed.
     """
     page = str(_macros().page(title, lead, sections, own_page))
     return "\n".join(map(printable, page.split("\n")))
 
 
-def picture_element(figure: Figure, alt: str, caption: str) -> str:
-    """Return an HTML figure with a caption, which contains the picture as a data URL.
+def html_blocks(blocks: Sequence[Block]) -> str:
+    """Return blocks as HTML, as they appear in a page."""
+    return str(_macros().blocks(blocks))
+
+
+def picture(figure: Figure, alt: str, caption: str) -> Block:
+    """Return a picture for light and dark pages, with a caption.
 
     Args:
-        figure: the picture.
+        figure: the picture; its ink and paper are changed to those of a dark page.
         alt: description of the picture for readers who cannot see it.
         caption: text below the picture.
     """
-    width, height, data = webp(figure, PICTURE_DPI)
-    return str(_macros().picture(base64.b64encode(data).decode(), width, height, alt, caption))
+    dpi = min(PICTURE_DPI, round(MAX_WIDTH_PX / figure.get_figwidth()))
+    width, height, data = webp(figure, dpi, colours=COLOURS)
+    darken(figure)
+    *_, dark_data = webp(figure, dpi, colours=COLOURS)
+    return Block(
+        "picture",
+        {
+            "data": base64.b64encode(data).decode(),
+            "dark_data": base64.b64encode(dark_data).decode(),
+            "width": width,
+            "height": height,
+            "alt": alt,
+            "caption": caption,
+        },
+    )
 
 
-def html_table(
+def table(
     caption: str,
     heads: Sequence[str] | None,
     rows: Sequence[Sequence[str]] = (),
     *,
     numbers: Iterable[int] = (),
     groups: Mapping[str, Sequence[Sequence[str]]] | None = None,
-) -> str:
-    """Return an HTML table in which the first cell of each row is the head of the row.
+) -> Block:
+    """Return a table in which the first cell of each row is the head of the row.
 
     Args:
         caption: text above the table.
@@ -96,32 +130,38 @@ def html_table(
         groups: further rows, keyed by the title of their group.
     """
     titled = ([("", rows)] if rows else []) + list((groups or {}).items())
-    return str(_macros().table(caption, heads, titled, set(numbers)))
+    content = {"caption": caption, "heads": heads, "groups": titled, "numbers": set(numbers)}
+    return Block("table", content)
 
 
-def paragraph(text: str) -> str:
-    """Return an HTML paragraph."""
-    return f"<p>{escape(text)}</p>\n"
+def paragraph(text: str) -> Block:
+    """Return a paragraph."""
+    return Block("paragraph", {"text": text})
 
 
-def notice(text: str) -> str:
-    """Return a highlighted HTML paragraph."""
-    return f'<p class="notice" role="note">{escape(text)}</p>\n'
+def notice(text: str) -> Block:
+    """Return a highlighted paragraph."""
+    return Block("notice", {"text": text})
 
 
-def bullets(texts: Iterable[str]) -> str:
-    """Return an HTML list of texts."""
-    return str(_macros().bullets(texts))
+def bullets(texts: Iterable[str]) -> Block:
+    """Return a list of texts."""
+    return Block("bullets", {"texts": list(texts)})
 
 
-def key_figures(figures: Iterable[tuple[str, str]]) -> str:
-    """Return HTML boxes side by side, each with a label and a figure."""
-    return str(_macros().key_figures(figures))
+def key_figures(figures: Iterable[tuple[str, str]]) -> Block:
+    """Return boxes side by side, each with a label and a figure."""
+    return Block("key_figures", {"figures": list(figures)})
 
 
-def folded(summary: str, text: str) -> str:
-    """Return a folded HTML element, which shows a long text when unfolded."""
-    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>\n"
+def rendered(html: str) -> Block:
+    """Return HTML that a library has rendered and escaped."""
+    return Block("rendered", {"html": html})
+
+
+def folded(summary: str, text: str) -> Block:
+    """Return a long text that the reader unfolds."""
+    return Block("folded", {"summary": summary, "text": text})
 
 
 def metric_text(metrics: Mapping[str, Any], key: str) -> str:
@@ -177,13 +217,3 @@ def time_span_text(run: RunFolder) -> str:
     size, length = count_text(len(run.names), "data center"), count_text(run.hours / 24, "day")
     span = f"{time_text(run, begin)} to {time_text(run, last)}, local standard time"
     return f"{size}, {length} from {span}"
-
-
-def run_labels(runs: Sequence[RunFolder]) -> list[str]:
-    """Return distinct labels of runs: the controller, plus folder and number if necessary."""
-    names = [run.metrics["controller"] for run in runs]
-    if len(set(names)) < len(names):
-        names = [f"{n} ({run.path.resolve().name})" for n, run in zip(names, runs, strict=True)]
-    if len(set(names)) < len(names):
-        names = [f"{name} #{index + 1}" for index, name in enumerate(names)]
-    return names

@@ -1,32 +1,27 @@
-"""Tables of metrics in a report: all metrics, ranking of data centers, comparison of runs."""
+"""Tables of metrics in a report: all metrics, and a ranking of data centers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from sdc_taichi.errors import SdcError
 from sdc_taichi.run.folder_reader import RunFolder
 
-from .fleet_figures import RADAR_METRICS, radar
 from .plotting import format_number
 from .report_html import (
     DASH,
-    html_table,
+    Block,
     metric_text,
-    names_text,
-    notice,
-    picture_element,
-    run_labels,
+    table,
 )
 
 MAX_DC_COLUMNS = 6
 """Largest number of data centers with one column each in the table of metrics."""
-COMPARED_PER_TABLE = 4
-"""Largest number of runs, besides the first, in a comparison table; more do not fit a page."""
 WORST_RANKS, BEST_RANKS = 5, 3
 """Number of worst and of best data centers in the ranking."""
 
+WORK = "Work"
+"""Title of the group of metrics of work, which runs show only where work was shifted."""
 METRICS = (
     (
         "Energy",
@@ -66,7 +61,7 @@ METRICS = (
         ),
     ),
     (
-        "Work",
+        WORK,
         (
             ("arrived_tasks", "arrived", "tasks"),
             ("executed_tasks", "executed", "tasks"),
@@ -103,28 +98,13 @@ METRICS = (
 Each group has a title and its metrics: name in metrics.json, label, unit.
 """
 
-COMPARED = (
-    *(key for key, *_ in RADAR_METRICS),
-    "grid_kwh",
-    "cost",
-    "peak_kw",
-    "pue",
-    "cue_kg_per_kwh",
-    "wue_l_per_kwh",
-    "dropped_tasks",
-    "overdue_task_h",
-    "hottest_inlet_c",
-    "inlet_above_27_h",
-)
-"""Names of the metrics in the comparison of runs."""
-
 RANKED = ("hottest_inlet_c", "pue", "cue_kg_per_kwh", "wue_l_per_kwh", "dropped_tasks")
 """Names of the metrics in the ranking of data centers; larger values are worse."""
 LABELS = {key: (label, unit) for _, group in METRICS for key, label, unit in group}
 """Label and unit of each metric, keyed by its name."""
 
 
-def metrics_section(run: RunFolder) -> str:
+def metrics_section(run: RunFolder) -> list[Block]:
     """Return the table of all metrics, and a ranking of the data centers if there are many.
 
     The table has one column per data center, or for many data centers their range.
@@ -135,6 +115,8 @@ def metrics_section(run: RunFolder) -> str:
     heads = ["metric", "unit", *columns, *["all"] * are_several]
     groups = {}
     for group, metrics in METRICS:
+        if group == WORK and not has_shifted_work(run):
+            continue
         groups[group] = [
             [
                 label,
@@ -151,11 +133,17 @@ def metrics_section(run: RunFolder) -> str:
         else "Sums and means over the run."
     )
     numbers = range(2, len(heads)) if are_few else (3, 5)
-    table = html_table(caption, heads, numbers=numbers, groups=groups)
-    return table if are_few else table + _ranking(dcs)
+    whole = table(caption, heads, numbers=numbers, groups=groups)
+    return [whole] if are_few else [whole, _ranking(dcs)]
 
 
-def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
+def has_shifted_work(run: RunFolder) -> bool:
+    """Return True if work of a run waited, or was dropped or lost."""
+    total = run.metrics["total"]
+    return any(total[key] > 0 for key in ("queue_max_tasks", "dropped_tasks", "lost_tasks"))
+
+
+def _ranking(dcs: Sequence[dict[str, Any]]) -> Block:
     """Return the table of the worst and the best data centers in each metric of ``RANKED``."""
     ranked = {key: sorted(_values(dcs, key), key=lambda pair: -pair[0]) for key in RANKED}
     groups = {}
@@ -164,7 +152,7 @@ def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
         ranks = [str(rank + 1) for rank in range(count)]
         groups[group] = list(zip(ranks, *columns, strict=True))
     heads = ["rank", *("{} ({})".format(*LABELS[key]) for key in RANKED)]
-    return html_table("Worst and best data centers by five metrics", heads, groups=groups)
+    return table("Worst and best data centers by five metrics", heads, groups=groups)
 
 
 def _values(dcs: Sequence[dict[str, Any]], key: str) -> list[tuple[float, str]]:
@@ -204,86 +192,3 @@ def _range(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
     if low[0] == high[0]:
         return [format_number(low[0]), mean, format_number(high[0])]
     return [f"{format_number(low[0])} {low[1]}", mean, f"{format_number(high[0])} {high[1]}"]
-
-
-def comparison_section(
-    runs: Sequence[RunFolder], shares: Sequence[float | None] | None = None
-) -> str:
-    """Return the comparison of runs with the first run: tables of metrics, and a radar chart.
-
-    Args:
-        runs: the runs.
-        shares: share of the achievable of each run, or None if it is unknown; None for all runs
-            if there is no optimum.
-
-    Raises:
-        SdcError: the runs have different lengths, or there are too many.
-    """
-    first, labels = runs[0], run_labels(runs)
-    for run in runs[1:]:
-        if abs(run.hours - first.hours) > 1e-9:
-            raise SdcError(
-                f"{run.path}: {run.hours:g} h, {first.path}: {first.hours:g} h; runs to "
-                "compare must be of equal length"
-            )
-    totals = {label: run.metrics["total"] for label, run in zip(labels, runs, strict=True)}
-    fingerprint = first.metrics["fingerprint"]
-    different = [
-        label
-        for label, run in zip(labels, runs, strict=True)
-        if run.metrics["fingerprint"] != fingerprint
-    ]
-    parts = []
-    if different:
-        parts.append(
-            notice(
-                f"Other configs, inputs or precision than {labels[0]}: {names_text(different)}. "
-                "Differences come not from the controller alone."
-            )
-        )
-    share_of = None if shares is None else dict(zip(labels, shares, strict=True))
-    for start in range(1, len(runs), COMPARED_PER_TABLE):
-        columns = [labels[0], *labels[start : start + COMPARED_PER_TABLE]]
-        parts.append(_comparison_table({label: totals[label] for label in columns}, share_of))
-    worst = "; ".join(
-        f"{label} {format_number(max(total[key] for total in totals.values()))} {unit}"
-        for key, label, unit in RADAR_METRICS
-    )
-    parts.append(
-        picture_element(
-            radar(totals),
-            f"Radar of five metrics for {names_text(labels)}. Worst values: {worst}.",
-            "Each axis runs from the value in the middle to the worst of the runs at the rim; less "
-            "is better.",
-        )
-    )
-    return "".join(parts)
-
-
-def _comparison_table(
-    totals: Mapping[str, Mapping[str, Any]], share_of: Mapping[str, float | None] | None
-) -> str:
-    """Return a table of metrics of several runs, with changes relative to the first run.
-
-    Args:
-        totals: metrics of each run over all data centers, keyed by the label of the run.
-        share_of: share of the achievable of each run, keyed by label; None without an optimum.
-    """
-    base, *_ = totals.values()
-    rows = []
-    for key in COMPARED:
-        cells = [*LABELS[key], metric_text(base, key)]
-        for total in list(totals.values())[1:]:
-            text = metric_text(total, key)
-            # Temperatures have no relative change, because their zero is arbitrary.
-            if base.get(key) and total.get(key) is not None and not key.endswith("_c"):
-                text += f" ({100 * (total[key] / base[key] - 1):+z.2f} %)"
-            cells.append(text)
-        rows.append(cells)
-    if share_of is not None:
-        shares = [share_of[label] for label in totals]
-        texts = [DASH if share is None else f"{100 * share:z.1f}" for share in shares]
-        rows.append(["share of the achievable", "%", *texts])
-    heads = ["metric", "unit", *totals]
-    caption = f"All data centers of each run; changes are against {heads[2]}"
-    return html_table(caption, heads, rows, numbers=range(2, len(heads)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.air_metrics import TIE_K, rank
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C, TIE_K, allowable_c, rank
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.run.achievable import OPTIMUM
 from sdc_taichi.run.folder_reader import (
@@ -24,24 +24,28 @@ from sdc_taichi.run.folder_reader import (
 )
 from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks, remarks_beside
 
-from . import dashboards, data_figures, figures, fleet_figures
+from . import dashboards, data_figures, figures, fleet_figures, rack_maps
 from .plotting import format_number, scale_thousands, with_local_time
 from .report_html import (
     DASH,
     MAX_ROWS,
+    Block,
     first_texts,
     folded,
-    html_table,
     paragraph,
-    picture_element,
+    picture,
+    table,
     time_text,
 )
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_SHOWN_DCS = 4
+MAX_SHOWN_DCS = 3
 """Largest number of data centers that all have pictures; larger fleets show extreme ones."""
+MAX_DETAILED_DCS = 2
+"""Largest number of shown data centers with pictures of setpoints and battery, so that a report
+stays small."""
 YEAR_FROM_H = 48.0
 """Shortest run that is drawn as heat maps by day and hour, in h."""
 
@@ -74,13 +78,13 @@ class ShownDataCenter:
     """Config of the data center."""
 
 
-def fleet_section(run: RunFolder) -> str:
+def fleet_section(run: RunFolder) -> list[Block]:
     """Return the section of the whole fleet: sums over the run, and hottest inlets over time."""
     fleet = read_fleet_steps(run)
     count = len(run.names)
     powers_kw = (fleet.series["it_w"] + fleet.series["overhead_w"]).to_numpy() / 1e3
     power, unit = scale_thousands(powers_kw, "kW", "MW")
-    out = picture_element(
+    overview = picture(
         fleet_figures.fleet_overview(fleet.series),
         f"Power, PUE, emitted carbon and hottest inlets of all {count} data centers over the run. "
         f"Highest power {power.max():.3g} {unit}, "
@@ -97,12 +101,13 @@ def fleet_section(run: RunFolder) -> str:
             if count > fleet_figures.MAX_MAP_ROWS
             else ""
         )
-        out += picture_element(
+        hot_halls = picture(
             fleet_figures.fleet_map(fleet.edge_times, fleet.inlet_max_c, run.names),
             f"Hottest inlet of each data center over time, hottest data centers first: {hottest}.",
             f"Which halls ran hot, and when: the hottest inlet of each.{cut}",
         )
-    return out
+        return [overview, hot_halls]
+    return [overview]
 
 
 def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
@@ -116,7 +121,6 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
             ("hottest_inlet_c", max, "hottest inlet"),
             ("pue", max, "highest PUE"),
             ("cue_kg_per_kwh", max, "most carbon per IT energy"),
-            ("cue_kg_per_kwh", min, "least carbon per IT energy"),
         ):
             known = [i for i, dc in enumerate(dcs) if dc["metrics"][key] is not None]
             # If a metric has the same value in all data centers, none of them is extreme.
@@ -132,8 +136,17 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
     ]
 
 
-def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
-    """Return the section of a data center: text, pictures and config."""
+def data_center_section(
+    run: RunFolder, dc: ShownDataCenter, *, detailed: bool = True, has_maps: bool = True
+) -> list[Block]:
+    """Return the section of a data center: text, pictures and config.
+
+    Args:
+        run: the run.
+        dc: the data center.
+        detailed: True to include pictures of setpoints and battery.
+        has_maps: True to include the maps of the racks.
+    """
     steps, hall = dc.steps, dc.config.hall
     parts = [paragraph(f"Shown because {dc.reason} of {len(run.names):,}.")] if dc.reason else []
     location = run.metrics["data_centers"][dc.index]["location"]
@@ -154,25 +167,31 @@ def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
             f"{format_number(at['crac_flow_m3s'])} and of servers "
             f"{format_number(at['it_airflow_m3s'])} m³/s."
         )
-        parts += [paragraph(conditions), _data_center_pictures(run, dc, when)]
-    return "".join(parts) + folded("Configuration", dc.config.to_yaml())
+        parts.append(paragraph(conditions))
+        parts += rack_maps_blocks({"": run}, dc) if has_maps else []
+        parts += _data_center_pictures(run, dc, when, detailed)
+    return [*parts, folded("Configuration", dc.config.to_yaml())]
 
 
-def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str) -> str:
+def _data_center_pictures(
+    run: RunFolder, dc: ShownDataCenter, hottest_text: str, detailed: bool
+) -> list[Block]:
     """Return the pictures of one data center.
 
     Args:
         run: the run.
         dc: the data center.
         hottest_text: temperature and time of the hottest inlet of the data center, as text.
+        detailed: True to include pictures of setpoints and battery.
+        has_maps: True to include the maps of the racks.
     """
     name, steps = run.names[dc.index], dc.steps
-    out = [_hot_racks_picture(run, dc), _whole_run_picture(run, name, steps)]
+    out = _whole_run_picture(run, name, steps)
     date = dashboards.hottest_day(steps)
     if int((steps["time"].dt.strftime("%Y-%m-%d") == date).sum()) > 1:
         events = run.metrics["data_centers"][dc.index]["events"]
         out.append(
-            picture_element(
+            picture(
                 dashboards.day(steps, date, name, events),
                 f"Temperatures, power, carbon, commands, queue and battery of {name} on the day of "
                 f"its hottest inlet, {hottest_text}.",
@@ -180,63 +199,101 @@ def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str
                 "inlet; failures and racks under protection are shaded.",
             )
         )
-    out.append(
-        picture_element(
-            dashboards.setpoint_scatter(steps, name),
-            f"Steps of {name} by outdoor temperature and IT power, coloured by setpoint, by HVAC "
-            "over IT power and by hottest inlet.",
-            "Which setpoint was used at which weather and load, what cooling cost there and how "
-            "hot it became.",
-        )
-    )
-    if float(np.ptp(steps["soc"])) > 0:
+    if detailed and float(np.ptp(steps["setpoint_c"])) > 0:
         out.append(
-            picture_element(
+            picture(
+                dashboards.setpoint_scatter(steps, name),
+                f"Steps of {name} by outdoor temperature and IT power, coloured by setpoint, by "
+                "HVAC power as a share of IT power, and by hottest inlet.",
+                "Which setpoint was used at which weather and load, what cooling cost there and "
+                "how hot it became.",
+            )
+        )
+    if detailed and float(np.ptp(steps["soc"])) > 0:
+        out.append(
+            picture(
                 dashboards.battery_profile(steps, name),
                 f"Carbon intensity, battery power and battery charge of {name} by time of day.",
                 "What the battery did over the day. Lines are means over the days, bands hold 80 % "
                 "of them.",
             )
         )
-    return "".join(out)
+    return out
 
 
-def _hot_racks_picture(run: RunFolder, dc: ShownDataCenter) -> str:
-    """Return the picture of how long each rack had the hottest inlet of its hall."""
-    name, hall = run.names[dc.index], dc.config.hall
+def rack_maps_blocks(runs: Mapping[str, RunFolder], dc: ShownDataCenter) -> list[Block]:
+    """Return the maps of the racks over each run: highest inlet, and hours above the recommended.
+
+    Args:
+        runs: runs of one hall, keyed by name; a single run needs no name.
+        dc: the data center, as the first of the runs shows it.
+    """
+    hall, first, (_, recommended_c) = dc.config.hall, next(iter(runs.values())), RECOMMENDED_C
+    name = first.names[dc.index]
+    allowable = allowable_c(dc.config.protection.ashrae_class)[1]
+    racks_of = {label: read_racks(run, [dc.index])[0] for label, run in runs.items()}
     hours = dc.racks["hottest_h"].to_numpy()
     row, rack = divmod(int(hours.argmax()), hall.racks_per_row)
     others = int(np.count_nonzero(hours == hours.max())) - 1
-    return picture_element(
-        dashboards.hot_racks(dc.racks, hall, name),
-        f"Racks of {name} by the time that each had the hottest inlet of the hall; most often "
-        f"row {row}, rack {rack}{f' and {others} more' * (others > 0)}, "
-        f"{100 * hours.max() / run.hours:.0f} % of the time.",
-        "Where the hall ran hot: how long each rack had the hottest inlet, and its highest inlet. "
-        f"Racks within {TIE_K:g} K of the hottest count with it; grey racks never did. Row 0 is on "
-        "top.",
+    most_often = (
+        f"Most often the hottest was row {row}, rack {rack}{f' and {others} more' * (others > 0)}: "
+        f"{100 * hours.max() / first.hours:.0f} % of the time. "
+        if len(runs) == 1
+        else ""
     )
+    inlet = picture(
+        rack_maps.inlet_map(racks_of, hall, allowable),
+        f"Map of the racks of {name} by their highest inlet over the run. {most_often}",
+        f"Highest inlet of each rack over the run. The colours change at {recommended_c:g} °C, the "
+        f"highest recommended inlet, and at {allowable:g} °C, the highest allowable one. "
+        f"{most_often}Row 0 is on top; racks within {TIE_K:g} K of the hottest are marked.",
+    )
+    above_h = {label: racks["above_27_h"].to_numpy() for label, racks in racks_of.items()}
+    unknown = [label for label, of_racks in above_h.items() if np.isnan(of_racks).any()]
+    if unknown:
+        text = "Hours above the recommended inlet were not counted; simulate the run again."
+        return [inlet, paragraph(" ".join([*(f"{label}:" for label in unknown if label), text]))]
+    above = {label: racks_of[label] for label, of_racks in above_h.items() if of_racks.any()}
+    never = ", ".join(label for label in above_h if label not in above)
+    cool = f"No rack was above {recommended_c:g} °C, the highest recommended inlet"
+    if not above:
+        return [inlet, paragraph(f"{cool}, at any time.")]
+    caption = (
+        f"How long the hottest inlet of each rack was above {recommended_c:g} °C, the highest "
+        "recommended inlet; grey racks never were."
+    )
+    return [
+        inlet,
+        picture(
+            rack_maps.hours_map(above, hall),
+            f"Map of the racks of {name} by the hours in which an inlet was above "
+            f"{recommended_c:g} °C.",
+            f"{caption} {f'{cool} in {never}.' if never else ''}",
+        ),
+    ]
 
 
-def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
+def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> list[Block]:
     """Return heat maps by day and hour, or a step plot for short runs; empty up to one day."""
     if run.hours >= YEAR_FROM_H:
-        return picture_element(
+        whole = picture(
             dashboards.year(steps, name),
             f"Weather, hottest inlet, power and carbon of {name} by day and hour of the day, "
             "and energy and carbon by day or month.",
             "The run by day, to the right, and time of day, upwards.",
         )
+        return [whole]
     if run.hours > 24.0:
-        return picture_element(
+        whole = picture(
             figures.overview(steps),
             f"Weather, power by device, carbon, queue and battery of {name} over the run.",
             f"The whole run of {name}.",
         )
-    return ""
+        return [whole]
+    return []
 
 
-def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
+def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> list[Block]:
     """Return the section of pictures of the inputs: weather, carbon intensity and workload."""
     names = [run.names[dc.index] for dc in shown]
     origin = "as the run read them" + (", SYNTHETIC in part" if run.metrics["synthetic"] else "")
@@ -251,7 +308,7 @@ def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
             f"{name} {quantity.factor * values.mean():.4g}" for name, values in series.items()
         )
         out.append(
-            picture_element(
+            picture(
                 data_figures.comparison(series, quantity),
                 f"{label} by time and by hour of the day. Means: {means}.",
                 f"{label}, {origin}.",
@@ -261,14 +318,14 @@ def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
         has_means = all(data_figures.daily(values).mean().min() > 0 for values in series.values())
         if column == "ci_g_per_kwh" and has_means and len(series) > 1:
             out.append(
-                picture_element(
+                picture(
                     data_figures.carbon_variation(series),
                     "Mean carbon intensity against its variation within the day.",
                     "Mean carbon intensity against its variation within the day: to the right, the "
                     "time of use matters more.",
                 )
             )
-    return "".join(out)
+    return out
 
 
 def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dict[str, pd.Series]:
@@ -319,7 +376,9 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
     return None
 
 
-def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]) -> str:
+def optimum_section(
+    run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]
+) -> list[Block]:
     """Return the section of an optimum: its table, and pictures of the day of largest saving.
 
     Args:
@@ -330,10 +389,10 @@ def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[Shown
     content = optimum.content
     of_run = remarks_beside(run.metrics) if _beside_optimum(run, content) is not None else []
     remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *of_run])))
-    parts = [*map(paragraph, remarks), _table(run, content)]
+    parts = [*map(paragraph, remarks), _optimum_table(run, content)]
     if run.metrics["steps_done"] > 1:
         parts += [_day_picture(run, optimum, dc) for dc in shown]
-    return "".join(parts)
+    return parts
 
 
 def share_of(run: RunFolder, optimum: KnownOptimum) -> float | None:
@@ -397,7 +456,7 @@ def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, 
     return entry if all(entry.get(name) == content[name] for name in decisive) else None
 
 
-def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
+def _optimum_table(run: RunFolder, content: Mapping[str, Any]) -> Block:
     """Return the table of figures of an optimum, for each data center and for all together."""
     controllers, dcs = content["controllers"], content["data_centers"]
     beside = _beside_optimum(run, content) is not None
@@ -431,7 +490,7 @@ def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
     if len(dcs) > 1:
         shares = (each.get("share") for each in controllers)
         rows.append(row("all", content["total"], run.metrics["total"], shares))
-    return html_table(caption, heads, rows, numbers=range(1, len(heads)))
+    return table(caption, heads, rows, numbers=range(1, len(heads)))
 
 
 def _percent(share: Any) -> float | None:
@@ -439,7 +498,7 @@ def _percent(share: Any) -> float | None:
     return 100.0 * share if is_number(share) else None
 
 
-def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> str:
+def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> Block:
     """Return the picture of the day on which the optimum saves most against the run.
 
     If the run is that of the optimum, the picture shows the day on which the battery moves most
@@ -465,7 +524,7 @@ def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> 
         saved = (dc.steps[_SAVED[saving]] - best[_SAVED[saving]]).to_numpy()
         caption = f"The day on which the achieved path saves most {saving} against this run."
     date = figures.day_of_most_saved(saved, dc.steps["time"])
-    return picture_element(
+    return picture(
         figures.optimum_day(steps_of, date, name, by_price=objective == "cost"),
         f"Grid, utilisation, setpoint and battery charge of {name} on a day under "
         f"{' and '.join(steps_of)}.",

@@ -24,8 +24,9 @@ from sdc_taichi import (
     make_controller,
     simulate_to_folder,
 )
+from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
-from sdc_taichi.viz import dashboards, figures, fleet_figures
+from sdc_taichi.viz import dashboards, figures, fleet_figures, rack_maps
 from sdc_taichi.viz.figures import clock_text, draw_hall, hall_map, overview, step_time
 from sdc_taichi.viz.plotting import DPI, format_time_axis, new_figure, webp
 
@@ -98,13 +99,26 @@ def simulate_run(out: Path, controller: str, days: int, values: list[str]) -> di
 def draw_year(folder: Path, scratch: Path) -> None:
     """Dashboards of a year."""
     simulate_run(scratch, CONTROLLERS["g36, load and battery greedy"], 365, [])
-    (steps,), (racks,) = read_steps(read_run(scratch), [0]), read_racks(read_run(scratch), [0])
-    hall = load_config("corrected").hall
+    (steps,) = read_steps(read_run(scratch), [0])
     save(dashboards.year(steps, "New York"), folder / "year.webp", dpi=75)
     save(dashboards.day(steps, "07-15", "New York"), folder / "day.webp")
     save(dashboards.setpoint_scatter(steps, "New York"), folder / "setpoint_scatter.webp", dpi=85)
     save(dashboards.battery_profile(steps, "New York"), folder / "battery_profile.webp")
-    save(dashboards.hot_racks(racks, hall, "New York"), folder / "hot_racks.webp")
+
+
+def draw_racks(folder: Path, scratch: Path) -> None:
+    """Racks of a mixed hall over two weeks of July, with two setpoints."""
+    racks_of = {}
+    hall = load_config("hall_of_2026")
+    for setpoint_c in (23, 25):
+        values = ["site.location=NY", "site.start=07-01", f"hvac.setpoint.initial_c={setpoint_c}"]
+        out = scratch / f"racks-{setpoint_c}"
+        with Simulator(load_config("hall_of_2026", values)) as sim:
+            request = RunRequest("idle", 14 * DAY)
+            simulate_to_folder(sim, make_controller("idle", sim.fleet), request, out)
+        (racks_of[f"supply air of {setpoint_c} °C"],) = read_racks(read_run(out), [0])
+    allowable = allowable_c(hall.protection.ashrae_class)[1]
+    save(rack_maps.inlet_map(racks_of, hall.hall, allowable), folder / "rack_inlets.webp")
 
 
 def draw_controllers(folder: Path, scratch: Path) -> None:
@@ -123,6 +137,7 @@ def main(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         draw_controllers(folder, Path(scratch))
         draw_year(folder, Path(scratch) / "year")
+        draw_racks(folder, Path(scratch))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from sdc_taichi.learning.evaluation_table import markdown as _markdown
 from sdc_taichi.learning.statistics import performance_profile
 from sdc_taichi.viz.fleet_figures import MAX_RUNS, interval_plot, profile_plot
 from sdc_taichi.viz.plotting import new_figure
-from sdc_taichi.viz.report_html import html_page, names_text, picture_element
+from sdc_taichi.viz.report_html import html_page, names_text, picture, rendered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,12 +150,12 @@ def html_report(title: str, lead: str, sections: Sections) -> str:
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     shown = {
-        heading: "".join(
-            page.render(block)
+        heading: [
+            rendered(page.render(block))
             if isinstance(block, str)
-            else picture_element(block.draw(), block.alt, block.caption)
+            else picture(block.draw(), block.alt, block.caption)
             for block in blocks
-        )
+        ]
         for heading, blocks in sections.items()
     }
     return html_page(title, lead, shown, set())

@@ -29,7 +29,7 @@ from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.sweep import sweep_command
 from sdc_taichi.cli.terminal import EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED, warnings_in_lines
 from sdc_taichi.cli.train import train_command
-from sdc_taichi.cli.view import report_command, view_command
+from sdc_taichi.cli.view import compare_command, report_command, view_command
 from sdc_taichi.errors import SdcError, one_line, place_in_user_code
 from sdc_taichi.user_functions import code_permitted_by
 
@@ -83,6 +83,7 @@ app.add_typer(data_app, name="data")
 app.add_typer(hall_app, name="hall")
 app.add_typer(policy_app, name="policy")
 app.command("report")(report_command)
+app.command("compare")(compare_command)
 app.command("view")(view_command)
 app.command("doctor")(doctor_command)
 app.command("new")(new_command)

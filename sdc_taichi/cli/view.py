@@ -1,23 +1,30 @@
-"""``sdc-taichi report`` and ``view``: write the HTML report of a run, and show its recording."""
+"""``sdc-taichi report``, ``compare`` and ``view``: show runs and their recordings."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import threading
 import time
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote
 
 import numpy as np
 import typer
+from rich.markup import escape
 
-from sdc_taichi.cli.options import check_out_file, force_option, out_option
+from sdc_taichi.cli.options import check_out_file, force_option, json_option, out_option
 from sdc_taichi.errors import ConfigError, SdcError, printable
 from sdc_taichi.user_file import open_input
+
+if TYPE_CHECKING:
+    from sdc_taichi.run.comparison import Comparison
+    from sdc_taichi.run.folder_reader import RunFolder
 
 WEB_PORT = 9090
 """Preferred port of the page that ``--web`` serves; if it is in use, another port is taken."""
@@ -26,15 +33,32 @@ _STOP_WAIT_S = 5.0
 _LOADING_WAIT_S = 120.0
 
 
+Runs = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="[NAME=]DIR...",
+        help="Folder of a run, and of others of the same hall; NAME is shown for it.",
+        show_default=False,
+    ),
+]
+Costs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--cost",
+        metavar="NAME=AMOUNT",
+        help="What it costs to make a variant, for its simple payback; repeatable.",
+    ),
+]
+StudiesFailover = Annotated[
+    bool,
+    typer.Option("--failover", help="Find out how many CRAC units may fail, as of hall failover."),
+]
+
+
 def report_command(
-    folders: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="DIR...",
-            help="Folder of a recorded run, and of others to compare it with.",
-            show_default=False,
-        ),
-    ],
+    folders: Runs,
+    cost: Costs = None,
+    failover: StudiesFailover = False,
     out: Annotated[
         Path | None,
         out_option("Output file. [default: DIR/report.html]", "FILE.html"),
@@ -43,26 +67,92 @@ def report_command(
 ) -> None:
     """Write a report of a recorded run: one HTML file with summary, tables and pictures.
 
-    It reads steps.parquet and metrics.json of the first folder. Further folders, of runs of equal
-    length, are compared with it in a table and a radar. The file needs no network.
+    Further folders, of runs of the same hall and length, are compared with the first as by
+    compare. The file needs no network.
     """
-    from sdc_taichi.run.folder_reader import read_run
+    from sdc_taichi.run.comparison import named_runs
     from sdc_taichi.viz.report import write_report
 
     if force and out is None:
         raise ConfigError("--force: valid with --out; DIR/report.html is replaced without it")
     check_out_file(out, ".html", force=force)
-    for index, folder in enumerate(folders):
-        if folder.resolve() in [other.resolve() for other in folders[:index]]:
-            raise ConfigError(f"{folder}: is given twice; valid is each run once")
-    runs = [read_run(folder) for folder in folders]
-    for run in runs:
+    runs = named_runs(folders)
+    for run in runs.values():
         done, asked = run.metrics["steps_done"], run.metrics["steps_asked"]
         if done < asked:
             typer.echo(
                 f"note: {printable(run.path)}: interrupted after {done} of {asked} steps", err=True
             )
-    typer.echo(f"Report: {printable(write_report(runs[0], runs[1:], out))}")
+    if len(runs) == 1 and (cost or failover):
+        raise ConfigError("--cost, --failover: one run; valid are two or more to compare")
+    comparison = None if len(runs) == 1 else _compare(runs, cost, failover=failover)
+    written = write_report(next(iter(runs.values())), comparison, out)
+    typer.echo(f"Report: {printable(written)}")
+
+
+def compare_command(
+    folders: Runs,
+    cost: Costs = None,
+    failover: StudiesFailover = False,
+    as_json: Annotated[bool, json_option("Print the comparison as JSON.")] = False,
+) -> None:
+    """Compare runs of one hall: what differs, figures a year, and savings against the first.
+
+    report with the same folders writes this as an HTML file, with pictures.
+    """
+    from sdc_taichi.run.comparison import comparison_values, named_runs
+    from sdc_taichi.viz.report_comparison import difference_rows, figure_rows, saving_rows
+
+    comparison = _compare(named_runs(folders), cost, failover=failover)
+    if as_json:
+        typer.echo(json.dumps(comparison_values(comparison), indent=2))
+        return
+    names = comparison.names
+    every = range(len(names))
+    if comparison.differences:
+        _print_rows("What differs", ["", *names], difference_rows(comparison, every))
+    _print_rows(
+        f"Figures; percentages are changes against {names[0]}",
+        ["", "unit", *names],
+        figure_rows(comparison, every),
+    )
+    _print_rows(
+        f"Savings against {names[0]}, in a year; below zero is more than there",
+        ["", "unit", *names[1:]],
+        saving_rows(comparison, every[1:]),
+    )
+    for note in comparison.notes:
+        typer.echo(printable(note))
+
+
+def _compare(
+    runs: Mapping[str, RunFolder], cost: Sequence[str] | None, *, failover: bool
+) -> Comparison:
+    """Compare runs, and tell on stderr whose failover is studied."""
+    from sdc_taichi.run.comparison import compare_runs, parse_costs
+
+    def tell(name: str) -> None:
+        typer.echo(f"failover of {printable(name)}", err=True)
+
+    costs = parse_costs(cost or [], list(runs))
+    return compare_runs(runs, costs, failover=failover, on_study=tell)
+
+
+def _print_rows(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table whose first column, and ``unit``, are aligned to the left."""
+    from rich.table import Table
+
+    from sdc_taichi.cli.terminal import wide_console
+
+    console = wide_console(200)
+    console.print(printable(title), markup=False)
+    shown = Table()
+    for index, head in enumerate(heads):
+        is_text = index == 0 or head == "unit"
+        shown.add_column(escape(printable(head)), justify="left" if is_text else "right")
+    for cells in rows:
+        shown.add_row(*(escape(printable(cell)) for cell in cells))
+    console.print(shown)
 
 
 def view_command(

@@ -202,23 +202,33 @@ def read_fleet_steps(run: RunFolder) -> FleetSteps:
     return FleetSteps(series, np.append(times[::interval], end), hottest)
 
 
-def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
-    """Read the configs of some data centers from the metadata of steps.parquet.
+def read_config_texts(run: RunFolder) -> list[str]:
+    """Read the config of each data center as YAML text from the metadata of steps.parquet.
 
     Raises:
-        SdcError: The configs are missing or not valid.
+        SdcError: The configs are missing.
     """
     text = _stored_metadata(run.steps_path).get("configs_yaml")
     if not isinstance(text, str):
         raise SdcError(f"{run.steps_path}: no configs_yaml; valid is a file written by simulate")
-    # Split the text at document separators and parse only the requested documents, because parsing
-    # all documents of a large fleet takes minutes.
     documents = ("\n" + text).split("\n---\n")
     documents = documents[1:] if len(documents) > 1 else documents
     if len(documents) != len(run.names):
         raise SdcError(
             f"{run.steps_path}: configs of {len(documents)} data centers, expected {len(run.names)}"
         )
+    return documents
+
+
+def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
+    """Read the configs of some data centers from the metadata of steps.parquet.
+
+    Only these are parsed, because parsing those of a large fleet takes minutes.
+
+    Raises:
+        SdcError: The configs are missing or not valid.
+    """
+    documents = read_config_texts(run)
     label = f"{run.steps_path}: configs_yaml"
     try:
         return [config_from_dict(load_yaml(documents[dc]), label) for dc in dcs]
@@ -233,6 +243,8 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
 
     Column ``hottest_h`` is the time, in h, during which the rack had the hottest inlet of its hall,
     within ``TIE_K``. Column ``inlet_max_c`` is the highest inlet temperature of the rack, in C.
+    Column ``above_27_h`` is the time, in h, during which its hottest inlet was above the
+    recommended 27 C; it is nan in runs that were recorded by versions that did not count it.
 
     Args:
         run: The run.
@@ -253,18 +265,21 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
     out = []
     for dc in dcs:
         try:
-            steps, highest = (
-                np.array(stored[dc][name], dtype=float) for name in ("hottest_steps", "inlet_max_c")
-            )
-        except (KeyError, TypeError, ValueError):
-            steps, highest = np.full((2, 1), np.nan)
-        flat = steps.ndim == 1 and steps.shape == highest.shape and len(steps) > 0
-        if not (flat and np.all((steps >= 0) & (steps <= done)) and np.all(np.isfinite(highest))):
+            values = {name: np.array(of, dtype=float) for name, of in stored[dc].items()}
+            hottest, highest_c = values["hottest_steps"], values["inlet_max_c"]
+        except (AttributeError, KeyError, TypeError, ValueError):
+            values, hottest, highest_c = {}, np.full(1, np.nan), np.full(1, np.nan)
+        above = values.get("above_27_steps", np.full(highest_c.shape, np.nan))
+        flat = hottest.ndim == 1 and hottest.shape == highest_c.shape == above.shape
+        counts = [hottest, above] if "above_27_steps" in values else [hottest]
+        valid = flat and len(hottest) > 0 and np.all(np.isfinite(highest_c))
+        if not (valid and all(np.all((steps >= 0) & (steps <= done)) for steps in counts)):
             raise SdcError(
                 f"{run.steps_path}: sdc_taichi_racks[{dc}] is {shortened(stored[dc])}; valid are "
-                f"hottest_steps, 0..{done}, and inlet_max_c of each rack"
+                f"hottest_steps and above_27_steps, 0..{done}, and inlet_max_c of each rack"
             )
-        out.append(pd.DataFrame({"hottest_h": steps * step_h, "inlet_max_c": highest}))
+        columns = {"hottest_h": hottest * step_h, "inlet_max_c": highest_c}
+        out.append(pd.DataFrame({**columns, "above_27_h": above * step_h}))
     return out
 
 

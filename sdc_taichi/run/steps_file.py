@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from sdc_taichi.atomic_file import AtomicFile, naming_errors
-from sdc_taichi.hall.air_metrics import TIE_K, rank
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, TIE_K, rank
 from sdc_taichi.run.time_column import time_column
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.inlet_parts import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
@@ -28,9 +28,10 @@ METADATA_KEY = b"sdc_taichi"
 RACKS_KEY = b"sdc_taichi_racks"
 """Metadata key of rack statistics, as JSON.
 
-The value is a list with one object per data center. ``hottest_steps`` is the number of steps in
-which each rack had the hottest inlet of its hall, within ``TIE_K``; ``inlet_max_c`` is the highest
-inlet temperature of each rack over the run, in C.
+The value is a list with one object per data center, whose lists have an entry for each rack.
+``hottest_steps`` is the number of steps in which the rack had the hottest inlet of its hall, within
+``TIE_K``; ``inlet_max_c`` is the highest inlet temperature of the rack over the run, in C;
+``above_27_steps`` is the number of steps in which its hottest inlet was above ``RECOMMENDED_C``.
 """
 AIR_KEY = b"sdc_taichi_air"
 """Metadata key of the air before the racks, as JSON.
@@ -157,7 +158,7 @@ class StepsWriter:
 
 
 class _RackCounts:
-    """Counts the steps in which each rack has the hottest inlet, and tracks its highest inlet.
+    """Counts steps with a hot inlet for each rack, and tracks the highest inlet of the rack.
 
     Several steps are processed at a time, because the cost of a NumPy call on a few racks is mostly
     overhead.
@@ -170,6 +171,7 @@ class _RackCounts:
         self._hottest_c = np.empty((rows, fleet.size))
         self._filled = 0
         self._steps = np.zeros(fleet.racks, dtype=np.int64)
+        self._above_steps = np.zeros(fleet.racks, dtype=np.int64)
         self._highest_c = np.full(fleet.racks, -np.inf)
 
     def add(self, result: StepResult) -> None:
@@ -183,11 +185,15 @@ class _RackCounts:
     def per_dc(self) -> list[dict[str, list[float]]]:
         """Return the value for ``RACKS_KEY`` from the added steps."""
         self._count()
-        ends = self._first[1:-1]
-        parts = np.split(self._steps, ends), np.split(self._highest_c.round(3), ends)
+        values = {
+            "hottest_steps": self._steps,
+            "inlet_max_c": self._highest_c.round(3),
+            "above_27_steps": self._above_steps,
+        }
+        parts = [np.split(of_racks, self._first[1:-1]) for of_racks in values.values()]
         return [
-            {"hottest_steps": steps.tolist(), "inlet_max_c": highest_c.tolist()}
-            for steps, highest_c in zip(*parts, strict=True)
+            {name: part.tolist() for name, part in zip(values, of_dc, strict=True)}
+            for of_dc in zip(*parts, strict=True)
         ]
 
     def _count(self) -> None:
@@ -195,6 +201,8 @@ class _RackCounts:
         inlet_c = self._inlet_c[: self._filled]
         limit_c = self._hottest_c[: self._filled] - TIE_K
         self._steps += np.count_nonzero(inlet_c >= limit_c[:, self._rack_dc], axis=0)
+        too_warm = inlet_c > RECOMMENDED_C[1] + LEAST_EXCESS_K
+        self._above_steps += np.count_nonzero(too_warm, axis=0)
         self._highest_c = np.maximum(self._highest_c, inlet_c.max(axis=0, initial=-np.inf))
         self._filled = 0
 
