@@ -186,7 +186,8 @@ def _number_racks(axes: Axes, image: Any, grid: Any, scale: _Scale, columns: int
     if not _has_numbers(grid, columns):
         return
     racks_per_row = grid.shape[1]
-    for (row, rack), value in np.ma.ndenumerate(grid):
+    for row, rack in zip(*np.nonzero(~np.ma.getmaskarray(grid)), strict=True):
+        value = float(grid[row, rack])
         red, green, blue, _ = image.cmap(image.norm(value))
         is_light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.55
         axes.text(

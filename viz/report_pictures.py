@@ -248,13 +248,8 @@ def rack_maps_blocks(runs: Mapping[str, RunFolder], dc: ShownDataCenter) -> list
         f"highest recommended inlet, and at {allowable:g} °C, the highest allowable one. "
         f"{most_often}Row 0 is on top; racks within {TIE_K:g} K of the hottest are marked.",
     )
-    above_h = {label: racks["above_27_h"].to_numpy() for label, racks in racks_of.items()}
-    unknown = [label for label, of_racks in above_h.items() if np.isnan(of_racks).any()]
-    if unknown:
-        text = "Hours above the recommended inlet were not counted; simulate the run again."
-        return [inlet, paragraph(" ".join([*(f"{label}:" for label in unknown if label), text]))]
-    above = {label: racks_of[label] for label, of_racks in above_h.items() if of_racks.any()}
-    never = ", ".join(label for label in above_h if label not in above)
+    above = {label: racks for label, racks in racks_of.items() if racks["above_27_h"].any()}
+    never = ", ".join(label for label in racks_of if label not in above)
     cool = f"No rack was above {recommended_c:g} °C, the highest recommended inlet"
     if not above:
         return [inlet, paragraph(f"{cool}, at any time.")]

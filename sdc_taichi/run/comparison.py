@@ -362,6 +362,7 @@ def _input_differences(runs: Sequence[RunFolder]) -> list[Difference]:
         "step (min)": [60 * run.metrics["step_h"] for run in runs],
         "errors of forecasts": [run.metrics.get("forecast_error") for run in runs],
         "first day": [run.metrics["data_centers"][0]["start"] for run in runs],
+        "year": [run.metrics["data_centers"][0]["year"] for run in runs],
         "version of sdc-taichi": [run.metrics["versions"].get("sdc-taichi") for run in runs],
     }
     sources = [

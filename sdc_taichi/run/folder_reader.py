@@ -244,7 +244,7 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
     Column ``hottest_h`` is the time, in h, during which the rack had the hottest inlet of its hall,
     within ``TIE_K``. Column ``inlet_max_c`` is the highest inlet temperature of the rack, in C.
     Column ``above_27_h`` is the time, in h, during which its hottest inlet was above the
-    recommended 27 C; it is nan in runs that were recorded by versions that did not count it.
+    recommended 27 C.
 
     Args:
         run: The run.
@@ -265,15 +265,15 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
     out = []
     for dc in dcs:
         try:
-            values = {name: np.array(of, dtype=float) for name, of in stored[dc].items()}
-            hottest, highest_c = values["hottest_steps"], values["inlet_max_c"]
-        except (AttributeError, KeyError, TypeError, ValueError):
-            values, hottest, highest_c = {}, np.full(1, np.nan), np.full(1, np.nan)
-        above = values.get("above_27_steps", np.full(highest_c.shape, np.nan))
+            hottest, above, highest_c = (
+                np.array(stored[dc][name], dtype=float)
+                for name in ("hottest_steps", "above_27_steps", "inlet_max_c")
+            )
+        except (KeyError, TypeError, ValueError):
+            hottest, above, highest_c = np.full((3, 1), np.nan)
         flat = hottest.ndim == 1 and hottest.shape == highest_c.shape == above.shape
-        counts = [hottest, above] if "above_27_steps" in values else [hottest]
         valid = flat and len(hottest) > 0 and np.all(np.isfinite(highest_c))
-        if not (valid and all(np.all((steps >= 0) & (steps <= done)) for steps in counts)):
+        if not (valid and all(np.all((s >= 0) & (s <= done)) for s in (hottest, above))):
             raise SdcError(
                 f"{run.steps_path}: sdc_taichi_racks[{dc}] is {shortened(stored[dc])}; valid are "
                 f"hottest_steps and above_27_steps, 0..{done}, and inlet_max_c of each rack"
