@@ -644,6 +644,30 @@ def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k,
 
 @ti.func
 @no_type_check
+def plant_limit_w(hall: ti.template(), n, running_w, offered_w, j_per_k):
+    """Return the heat that the plant can remove in a substep, at least 0, in W.
+
+    Economisers remove more heat from water that returns warmer. The limit is therefore L + G w,
+    where L grows with the heat at the coils, and w is the warmth of room and water at the end of
+    the substep. Without a plant w would be offered_w h / C. The heat that the plant removes lowers
+    w, which gives L + (offered_w - L) a / (1 + a) with a = G h / C, and L where all is removed.
+
+    Args:
+        hall: arguments of the hall kernel.
+        n: index of the data center.
+        running_w: heat from return air and fans that reaches the running coils, in W.
+        offered_w: heat above the setpoint, stored or generated in this substep, in W.
+        j_per_k: heat capacity C that warms with the water, in J/K.
+    """
+    dc = hall.dcs[n]
+    limit_w = dc.coil_limit_w + dc.limit_w_per_w * ti.max(running_w, 0.0)
+    gain = dc.limit_w_per_k * hall.substep_s / j_per_k
+    more_w = ti.max(offered_w - limit_w, 0.0) * (gain / (1.0 + gain))
+    return ti.max(limit_w + more_w, 0.0)
+
+
+@ti.func
+@no_type_check
 def share_with_water(hall: ti.template(), n, running_w, wanted_w):
     """Let chilled water and tank take up heat that the plant does not; return plant and coils, W.
 
@@ -663,8 +687,13 @@ def share_with_water(hall: ti.template(), n, running_w, wanted_w):
     carried_w = ti.max(dc.carried_w, dc.coil_limit_w)
     load_w = ti.min(wanted_w, carried_w) + dc.water_j / h
     recharge_w = ti.select(dc.tank_share > 0.0, dc.tank_j / h, 0.0)
-    plant_w = ti.min(ti.max(load_w + recharge_w, 0.0), dc.coil_limit_w)
     most_w = ti.max(dc.tank_share * dc.tank_most_j - dc.tank_j, 0.0) / h
+    # Room and water are equally warm, unless coils and pumps carry too little heat to the water.
+    offered_w = wanted_w + dc.water_j / h - most_w
+    limit_w = plant_limit_w(hall, n, running_w, offered_w, dc.room_j_per_k + dc.water_j_per_k)
+    offered_w = carried_w + dc.water_j / h - most_w
+    limit_w = ti.min(limit_w, plant_limit_w(hall, n, running_w, offered_w, dc.water_j_per_k))
+    plant_w = ti.min(ti.max(load_w + recharge_w, 0.0), limit_w)
     tank_w = ti.min(ti.max(load_w - plant_w, -recharge_w), most_w)
     sink_w = plant_w + tank_w
     stored_j = dc.room_j + dc.water_j + (running_w - sink_w) * h
@@ -700,7 +729,7 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
                 running_w += air * flow_m3s * unit.return_offset_k
                 at += hall.one
     wanted_w = ti.max(running_w + units.any_running * dc.room_j / hall.substep_s, 0.0)
-    plant_w = ti.min(wanted_w, dc.coil_limit_w)
+    plant_w = ti.min(wanted_w, plant_limit_w(hall, n, running_w, wanted_w, dc.room_j_per_k))
     coil_w = plant_w
     if dc.water_j_per_k > 0.0 and dc.carried_w > 0.0:
         plant_w, coil_w = share_with_water(hall, n, running_w, wanted_w)

@@ -259,9 +259,11 @@ def test_moisture_that_condenses_on_the_coils_is_a_load_of_the_chiller() -> None
     # hall between them, in which the coils bring a share of the air to 10 C.
     outdoors, at_coil = (
         moist_air.vapour_ratio(pa, design.pressure_pa[0])
-        for pa in (plants._vapour_pa(np.array([20.0]), np.array([14.8]), design.pressure_pa[:1]),
-                   moist_air.saturation_pa(10.0))
-    )  # fmt: skip
+        for pa in (
+            plants.outdoor_vapour_pa(np.array([20.0]), np.array([14.8]), design.pressure_pa[:1]),
+            moist_air.saturation_pa(10.0),
+        )
+    )
     share = (coil_w / flow_w_k / (20.0 - 10.0))[0]
     hall = (outdoors + share * at_coil) / (1.0 + share)
     condensed_w = 2486.0 * flow_w_k[0] * share * (hall - at_coil)
@@ -401,8 +403,8 @@ def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
     """Return True where dampers admit only a part of the outdoor air because of its moisture."""
     design = sized(*names).water_side
     _, setpoint_c, outdoor_c, depression_k = np.broadcast_arrays(*at)
-    vapour_pa = plants._vapour_pa(outdoor_c, outdoor_c - depression_k, design.pressure_pa)
-    share = plants._admitted_share(vapour_pa, setpoint_c, design)
+    vapour_pa = plants.outdoor_vapour_pa(outdoor_c, outdoor_c - depression_k, design.pressure_pa)
+    share = plants.admitted_share(vapour_pa, setpoint_c, design)
     return (names[0] == "air_side") & (share > 0.0) & (share < 1.0)
 
 

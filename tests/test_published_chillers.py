@@ -37,7 +37,7 @@ TRANE_CHILLED_C, TRANE_CONDENSER_C = (4.44, 8.89), (12.78, 35.0)
 def trane_eir(chilled_c: F64, condenser_c: F64) -> F64:
     """Full-load power over cooling of the published curves, evaluated within their bounds."""
     water = np.clip(chilled_c, *TRANE_CHILLED_C), np.clip(condenser_c, *TRANE_CONDENSER_C)
-    return np.asarray(chiller._biquadratic(TRANE_EIR, *water) / TRANE_COP)
+    return np.asarray(chiller.biquadratic(TRANE_EIR, *water) / TRANE_COP)
 
 
 def trane_w(plant: WaterSideResult, design: WaterSideDesign) -> F64:
@@ -155,7 +155,7 @@ def test_air_cooled_default_follows_a_catalogue_over_temperature_and_load() -> N
 def test_air_cooled_default_follows_published_curves_at_full_load(name: str) -> None:
     chilled_c, outdoor_c = np.meshgrid(np.linspace(4.44, 10, 9), np.linspace(23.89, 46.11, 20))
     capacity, eir = (
-        chiller._biquadratic(c, chilled_c, outdoor_c) / chiller._biquadratic(c, 6.67, 35.0)
+        chiller.biquadratic(c, chilled_c, outdoor_c) / chiller.biquadratic(c, 6.67, 35.0)
         for c in CURVES[name]
     )
     machine = air_cooled(np.full_like(outdoor_c, 9.0), outdoor_c, chilled_c, 3.0)
@@ -179,9 +179,9 @@ def test_air_cooled_default_needs_published_energy_in_every_climate() -> None:
         for name in ("scroll", "path A"):
             curve = CURVES[name][1]
             reach_c = np.arange(0.0, 20.0, 0.1)
-            coldest_c = reach_c[np.argmin(chiller._biquadratic(curve, 10.0, reach_c))]
-            eir = chiller._biquadratic(curve, 10.0, np.maximum(outdoor_c, coldest_c))
-            published = np.mean(np.asarray(eir / chiller._biquadratic(curve, 6.67, 35.0)))
+            coldest_c = reach_c[np.argmin(chiller.biquadratic(curve, 10.0, reach_c))]
+            eir = chiller.biquadratic(curve, 10.0, np.maximum(outdoor_c, coldest_c))
+            published = np.mean(np.asarray(eir / chiller.biquadratic(curve, 6.67, 35.0)))
             machine = air_cooled(np.full_like(outdoor_c, 9.0), outdoor_c, 10.0, 1.0)
             ratio = np.mean(1.0 / machine.cop) / published
             assert ratio == pytest.approx(1.0, abs=0.05), (site, name)

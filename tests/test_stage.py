@@ -14,6 +14,7 @@ from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage
 from sdc_taichi.plant import workload
 from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.sim.crac_units import UnitAir
 from sdc_taichi.sim.facility import Facility, StepInputs
 from sdc_taichi.types import F64
 
@@ -145,6 +146,8 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "state": SimpleNamespace(
             stored_kwh=sized.battery_kwh * rng.choice([0.0, 0.01, 0.5, 0.99, 1.0], n),
             room_heat_kwh=some(0.0, 50.0) * (rng.random(n) < 0.3),
+            water_heat_j=some(0.0, 1e8),
+            tank_heat_j=some(0.0, 1e8),
         ),
         "commands": SimpleNamespace(battery_command=rng.choice([-1.0, -0.3, 0.0, 0.5, 1.0], n)),
         "surroundings": SimpleNamespace(
@@ -181,6 +184,9 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
             cubed_flow_m3s=flow_m3s * some(0.1, 1.0),
             units_load_w=it_w * some(0.8, 1.2),
             coil_w=it_w * some(0.8, 1.2),
+            most_warmed_k=some(0.0, 8.0),
+            water_j=some(0.0, 1e8),
+            tank_j=some(0.0, 1e8),
             room_j=some(-1e6, 1e8),
         ),
     }
@@ -213,6 +219,8 @@ def test_facility_as_in_numpy(overrides: list[str] | str, event_free: bool) -> N
         facility = Facility(sim.fleet, sim.sizing, event_free=event_free)
         inputs = random_inputs(sim, rng, n)
     plant_inputs = {name: inputs[name] for name in ("surroundings", "supply")}
+    air = inputs["air"]
+    plant_inputs["air"] = UnitAir(air.units_return_c, air.units_flow_m3s, air.most_warmed_k)
 
     def step(**stages: Any) -> dict[str, F64]:
         return facility.step(StepInputs(**stages))

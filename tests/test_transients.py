@@ -617,6 +617,17 @@ def test_water_takes_up_the_heat_of_a_chiller_that_trips_and_returns_it() -> Non
     assert np.all(np.abs(run["room_heat_kwh"][-1, 2:]) < 1e-6)
 
 
+def test_pumps_run_while_water_and_tank_take_up_the_heat() -> None:
+    run, _ = tripped_chillers(loses("chiller_derate"), steps=22)
+    pump_w, before_w = run["chilled_pump_w"], run["chilled_pump_w"][10]
+    assert np.all(run["heat_removed_w"][16:22] == 0.0)
+    # A tank supplies water at the setpoint, and so needs the flow of before.
+    np.testing.assert_allclose(pump_w[16:18, 3], before_w[3], rtol=0.02)
+    # Where the water warms, valves open.
+    assert np.all(pump_w[20, :3] > 1.5 * before_w[:3])
+    np.testing.assert_allclose(run["hvac_w"][17, 3], (pump_w + run["crac_fan_w"])[17, 3])
+
+
 def test_water_stands_still_while_its_pumps_are_down() -> None:
     run, _ = tripped_chillers(
         loses("chiller_derate", 0.1), loses("pump_down", 0.1).replace("0.25", "0.35"), steps=40
@@ -664,6 +675,53 @@ def test_halls_with_water_equal_themselves_alone_and_after_a_saved_state() -> No
         old = {n: v for n, v in saved.items() if n != "tank_heat_j"} | {"version": np.array(3)}
         with pytest.raises(SdcError, match="snapshot: version 3, expected 4"):
             sim.load_state_dict(old)
+
+
+MILD = {"water_cooled": (20.0, 16.0), "air_cooled": (13.0, 8.0), "air_side": (24.0, 14.0)}
+"""Dry and wet bulb at which free cooling alone does not hold the setpoint, by plant, in C."""
+CUTS = {"chiller": [], "and half of the pumps": [loses("pump_down", 9.0, 0.5)],
+        "and a CRAC unit": [loses("crac_down", 9.0).replace(", share: 0.0", ", unit: 0")],
+        "and a tank": []}  # fmt: skip
+
+
+@pytest.mark.parametrize("plant", MILD)
+def test_free_cooling_alone_gives_all_that_warm_water_and_air_let_it(plant: str) -> None:
+    configs = [
+        load_config(
+            "corrected",
+            ["simulation.thermal=transient", "simulation.steps_per_hour=60", "hvac.crac.units=4",
+             f"hvac.plant={plant}", f"name=dc{i}", "hvac.sizing.design_wet_bulb_c=25.6",
+             "hvac.sizing.design_outdoor_c=35", *(WATER["stratified"] if "tank" in name else []),
+             f"events.scheduled=[{', '.join([loses('chiller_derate', 9.0), *more])}]"],
+        )
+        for i, (name, more) in enumerate(CUTS.items())
+    ]  # fmt: skip
+    outdoor_c, wet_bulb_c = (np.full((len(configs), 1), x) for x in MILD[plant])
+    one = np.ones_like(outdoor_c)
+    drivers = drivers_from_arrays(outdoor_c, wet_bulb_c, 300.0 * one, 0.6 * one)
+    with Simulator(configs, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        design, results = sim.sizing.water_side, [sim.step() for _ in range(120)]
+    result, removed_w = results[-1], np.array([r.heat_removed_w for r in results])
+    # Water and air become as warm as it takes to carry the whole load without a chiller.
+    np.testing.assert_allclose(removed_w[-1], result.cooling_load_w, rtol=0.03)
+    np.testing.assert_allclose(result.chiller_w, 0.0, atol=1e-6)
+    assert np.all(result.supply_c > result.setpoint_c + 1.0)
+    assert np.all(result.inlet_max_c < 45.0)
+    # No heat passes from cold to warm.
+    free_w, water_c = result.economiser_w, result.chilled_water_c
+    if plant == "water_cooled":
+        coldest_c = result.condenser_water_c + design.exchanger_approach_k
+        np.testing.assert_allclose(water_c[[0, 3]], coldest_c[[0, 3]], atol=0.4)
+    elif plant == "air_cooled":
+        return_k = design.chilled_water_range_k * result.heat_removed_w / design.cooling_w
+        over_k = water_c + return_k - result.outdoor_c
+        full_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
+        np.testing.assert_allclose(free_w[[0, 3]], (full_w * over_k / 14.0)[[0, 3]], rtol=0.03)
+    else:
+        over_k = result.return_c - result.outdoor_c
+        flow_w_k = design.air_j_per_m3_k * result.crac_flow_m3s
+        np.testing.assert_allclose(free_w, flow_w_k * over_k, rtol=0.03)
 
 
 def test_quasi_steady_halls_ignore_their_water_and_say_so() -> None:

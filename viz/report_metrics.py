@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sdc_taichi.run.folder_reader import RunFolder
+from sdc_taichi.run.metrics import without_repeated_pue
 
 from .plotting import format_number
 from .report_html import (
@@ -113,6 +114,7 @@ def metrics_section(run: RunFolder) -> list[Block]:
     are_few, are_several = len(dcs) <= MAX_DC_COLUMNS, len(dcs) > 1
     columns = [dc["name"] for dc in dcs] if are_few else ["lowest", "mean", "highest"]
     heads = ["metric", "unit", *columns, *["all"] * are_several]
+    names = without_repeated_pue([*LABELS], [dc["metrics"] for dc in dcs])
     groups = {}
     for group, metrics in METRICS:
         if group == WORK and not has_shifted_work(run):
@@ -125,6 +127,7 @@ def metrics_section(run: RunFolder) -> list[Block]:
                 *[metric_text(total, key)] * are_several,
             ]
             for key, label, unit in metrics
+            if key in names
         ]
     caption = (
         "Of all data centers, energies, carbon, water, tasks and hours are sums, ratios those of "

@@ -12,6 +12,7 @@ from sdc_taichi.cli.terminal import (
     first_lines,
     wide_console,
 )
+from sdc_taichi.run.metrics import without_repeated_pue
 
 NUMBER_FORMAT = "z.4g"
 """Format specification of figures below 1000."""
@@ -68,7 +69,9 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
         f"{dcs[0]['start']} ({steps} steps of {60 // steps_per_hour} min), "
         f"controller {metrics['controller']}"
     )
-    titles, keys = zip(*_ROWS, strict=True)
+    label_of = {key: label for label, key in _ROWS}
+    keys = without_repeated_pue([*label_of], [dc["metrics"] for dc in dcs])
+    titles = [label_of[key] for key in keys]
     columns = [[dc["metrics"][key] for key in keys] for dc in dcs]
     total = [metrics["total"][key] for key in keys]
     names = [dc["name"] for dc in dcs]

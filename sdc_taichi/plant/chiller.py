@@ -251,8 +251,8 @@ def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
     evaporator_c, entering_c = point.chilled_water_c, point.condenser_c
     return _from_curves(
         load_w,
-        point.reference_w * _biquadratic(YORK_CAPACITY, evaporator_c, entering_c),
-        eir=_biquadratic(YORK_EIR, evaporator_c, entering_c) / point.machine.reference_cop,
+        point.reference_w * biquadratic(YORK_CAPACITY, evaporator_c, entering_c),
+        eir=biquadratic(YORK_EIR, evaporator_c, entering_c) / point.machine.reference_cop,
         part_load=YORK_PART_LOAD,
         min_plr=0.1,
     )
@@ -478,6 +478,6 @@ def _quadratic(c: tuple[float, ...], x: Values) -> Values:
     return c[0] + x * (c[1] + x * c[2])
 
 
-def _biquadratic(c: tuple[float, ...], x: Values, y: Values) -> Values:
+def biquadratic(c: tuple[float, ...], x: Values, y: Values) -> Values:
     """Return the biquadratic c0 + c1*x + c2*x^2 + c3*y + c4*y^2 + c5*x*y."""
     return c[0] + c[1] * x + c[2] * x**2 + c[3] * y + c[4] * y**2 + c[5] * x * y

@@ -24,6 +24,7 @@ from sdc_taichi.plant.water_side import (
     coil_capacity_w,
     economiser_share,
     loop_pump_w,
+    warmth_w,
 )
 from sdc_taichi.types import F64, Values, WaterSideResult, as_array, fields_of
 
@@ -34,6 +35,8 @@ _DAMPER_BAND = 0.1
 """Proportional band of the dampers of outdoor air, as a share of the vapour pressure at a limit."""
 _CLEARLY_LESS = 1.0 - 1e-9
 """Cost of an operation divided by that of another below which it counts as less."""
+_LEAST_GAIN = 1e-9
+"""Lower bound of a gain in removed heat, divided by the heat to remove."""
 _LEAST_W, _LEAST_K, _LEAST_M3S = 1e-3, 1e-3, 1e-9
 """Lower bounds of divisors that are a power, a temperature difference or an airflow."""
 
@@ -54,6 +57,9 @@ class PlantPoint(NamedTuple):
     """Outdoor dry-bulb temperature, in C, (B,)."""
     wet_bulb_c: F64
     """Outdoor wet-bulb temperature, in C, (B,)."""
+    warmed_k: F64 | None = None
+    """Temperature of the chilled water above its setpoint at the coils, in K, (B,), whose heat is a
+    part of the load; all valves are open then. None for water at its setpoint."""
 
 
 class Devices(NamedTuple):
@@ -78,6 +84,8 @@ class PlantModel:
     """Function that computes one step from the heat to remove, in W, (B,)."""
     dry: bool
     """True if the chiller rejects its heat to outdoor air, without a cooling tower."""
+    outdoor_air: bool = False
+    """True if free cooling takes heat from the air, so that no water carries it."""
 
 
 def water_cooled(
@@ -99,11 +107,13 @@ def water_cooled(
     they can. Where they cannot reject all heat with water at ``max_condenser_c``, the chiller
     unloads to what they can.
     """
-    load_w = np.minimum(requested_w, coil_capacity_w(design)) if devices.limited else requested_w
+    load_w = (
+        np.minimum(requested_w, _most_load_w(point, design)) if devices.limited else requested_w
+    )
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
     # The economiser is in the return pipe of the coils, upstream of the bypass of the chiller.
     taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(
-        load_w, design, limited=devices.limited
+        load_w, design, limited=devices.limited, full_flow=point.warmed_k is not None
     )
     loop = _TowerLoop(
         taken_w, chilled_c, design.chilled_water_range_k * range_ratio, point, design, devices
@@ -190,7 +200,11 @@ class _TowerLoop:
         alone_c = np.maximum(nearest_c, design.min_condenser_c)
         precooled_c = np.maximum(nearest_c, useful_c)
         if self.devices.tower.water_loop:
-            heat_w = self._chiller(self.taken_w, alone_c).rejected_w
+            # The economiser may take heat of the coils that the chiller does not.
+            coils_w = self.taken_w
+            if self.point.warmed_k is not None:
+                coils_w = coils_w - warmth_w(self.point.warmed_k, design)
+            heat_w = np.maximum(self._chiller(self.taken_w, alone_c).rejected_w, coils_w)
             by_lift = (
                 design.idle_w_per_w_k * design.chiller_w + design.load_w_per_w_k * self.taken_w
             )
@@ -331,10 +345,12 @@ def air_cooled(
     speed worthwhile up to which 4 P_full q^3 = c Q_full. ``_worthwhile`` decides whether the cooler
     runs at all.
     """
-    load_w = np.minimum(requested_w, coil_capacity_w(design)) if devices.limited else requested_w
+    load_w = (
+        np.minimum(requested_w, _most_load_w(point, design)) if devices.limited else requested_w
+    )
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
     taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(
-        load_w, design, limited=devices.limited
+        load_w, design, limited=devices.limited, full_flow=point.warmed_k is not None
     )
     range_k = design.chilled_water_range_k * range_ratio
     over_k = np.maximum(chilled_c + range_k - point.outdoor_c, 0.0)
@@ -397,7 +413,7 @@ def air_side(
     Air that is drier than the lowest dew point is wetted by an adiabatic humidifier (second term),
     or stays outside if there is none. A hall contains no source of moisture, so its supply air
     takes on the moisture of the outdoor air. The dampers close gradually towards the limits of dew
-    point and of relative humidity at the supply setpoint, see ``_admitted_share``.
+    point and of relative humidity at the supply setpoint, see ``admitted_share``.
 
     Moisture of outdoor air that condenses on coils at the chilled-water temperature is a load of
     the chiller. Coils that remove the heat Q bring the airflow V_c = Q/(rho cp (T_inlet -
@@ -412,7 +428,7 @@ def air_side(
     """
     load_w = np.minimum(requested_w, design.cooling_w) if devices.limited else requested_w
     chilled_c = chilled_water_c(point.water_setpoint_c, design)
-    vapour_pa = _vapour_pa(point.outdoor_c, point.wet_bulb_c, design.pressure_pa)
+    vapour_pa = outdoor_vapour_pa(point.outdoor_c, point.wet_bulb_c, design.pressure_pa)
     ratio, least = (
         moist_air.vapour_ratio(pa, design.pressure_pa) for pa in (vapour_pa, design.least_vapour_pa)
     )
@@ -462,14 +478,33 @@ def air_side(
     )
     most_m3s = np.minimum(point.airflow_m3s, design.tower_air_m3s * design.outdoor_units)
     with_free = run(np.minimum(wanted_m3s, most_m3s))
-    admitted = _admitted_share(vapour_pa, point.setpoint_c, design)
+    admitted = admitted_share(vapour_pa, point.setpoint_c, design)
     return _mixed(without, with_free, admitted * _worthwhile(without, with_free, short_w))
+
+
+def completed(result: WaterSideResult, fullest: WaterSideResult, wanted_w: F64) -> WaterSideResult:
+    """Return means over a step in which the chilled water becomes as warm as the heat requires.
+
+    Coils that offer more heat return more or warmer water, of which economiser, dry cooler or
+    outdoor air remove more. Where a plant would remove less than ``wanted_w``, it therefore works
+    with the heat of ``fullest`` for as long as is necessary.
+
+    Args:
+        result: Plant with a load of ``wanted_w``.
+        fullest: The same plant with all the heat that coils and pumps can carry.
+        wanted_w: Heat to remove, in W, (B,).
+    """
+    short_w = wanted_w - result.heat_removed_w
+    gain_w = fullest.heat_removed_w - result.heat_removed_w
+    # The lower bound keeps rounding errors from deciding where there is no more to gain.
+    gain_w = np.maximum(gain_w, _LEAST_GAIN * np.maximum(wanted_w, 0.0) + _LEAST_W)
+    return _mixed(result, fullest, as_array(np.clip(short_w / gain_w, 0.0, 1.0)))
 
 
 PLANTS: dict[str, PlantModel] = {
     "water_cooled": PlantModel(water_cooled, dry=False),
     "air_cooled": PlantModel(air_cooled, dry=True),
-    "air_side": PlantModel(air_side, dry=True),
+    "air_side": PlantModel(air_side, dry=True, outdoor_air=True),
 }
 """Plant models by their names, the valid values of ``hvac.plant``."""
 
@@ -487,6 +522,12 @@ def default_chiller(plant: PlantModel) -> str:
 def fits(chiller: ChillerModel, plant: PlantModel) -> bool:
     """Return True if the plant provides the medium that cools the chiller's condenser."""
     return chiller.outdoor_air if plant.dry else chiller.tower_water
+
+
+def _most_load_w(point: PlantPoint, design: WaterSideDesign) -> F64:
+    """Return the largest heat that coils and chilled water bring to the plant, in W, (B,)."""
+    capacity_w = coil_capacity_w(design)
+    return capacity_w if point.warmed_k is None else capacity_w + warmth_w(point.warmed_k, design)
 
 
 def _run_chiller(
@@ -534,15 +575,15 @@ def _power_w(result: WaterSideResult) -> F64:
     return as_array(result.chiller_w + result.tower_fan_w + pumps_w)
 
 
-def _mixed(without: WaterSideResult, with_free: WaterSideResult, share: F64) -> WaterSideResult:
-    """Return the means over a step during a share of which, (B,), a plant uses free cooling."""
-    first, second = fields_of(without), fields_of(with_free)
+def _mixed(one: WaterSideResult, other: WaterSideResult, share: F64) -> WaterSideResult:
+    """Return the means over a step during a share of which, (B,), a plant works as in ``other``."""
+    first, second = fields_of(one), fields_of(other)
     return WaterSideResult(
         **{name: (1.0 - share) * first[name] + share * second[name] for name in first}
     )
 
 
-def _admitted_share(vapour_pa: F64, setpoint_c: F64, design: WaterSideDesign) -> F64:
+def admitted_share(vapour_pa: F64, setpoint_c: F64, design: WaterSideDesign) -> F64:
     """Return the share of the step during which the dampers admit outdoor air, 0..1, (B,).
 
     The supply air has the vapour pressure of the outdoor air and the temperature of the setpoint.
@@ -599,7 +640,7 @@ def _dry(
     )
 
 
-def _vapour_pa(outdoor_c: F64, wet_bulb_c: F64, pressure_pa: F64) -> F64:
+def outdoor_vapour_pa(outdoor_c: F64, wet_bulb_c: F64, pressure_pa: F64) -> F64:
     """Return the partial pressure of water vapour in outdoor air, in Pa, (B,)."""
     at_wet_bulb = moist_air.saturated_ratio(wet_bulb_c, pressure_pa)
     ratio = moist_air.humidity_ratio(outdoor_c, wet_bulb_c, at_wet_bulb)

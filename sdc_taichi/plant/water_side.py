@@ -230,8 +230,20 @@ def coil_capacity_w(design: WaterSideDesign) -> F64:
     return as_array(design.cooling_w * (flow * whole_k / resistance_k))
 
 
+def warmth_w(warmed_k: F64, design: WaterSideDesign) -> F64:
+    """Return the heat that the working pumps bring from a loop above its setpoint, in W, (B,).
+
+    Water that supplies the coils ``warmed_k`` too warm returns warmer by as much.
+
+    Args:
+        warmed_k: Temperature of the chilled water minus its setpoint, K, (B,).
+        design: Sized devices.
+    """
+    return as_array(design.pumped_w * warmed_k / design.chilled_water_range_k)
+
+
 def chilled_water_load_w(
-    load_w: F64, design: WaterSideDesign, *, limited: bool
+    load_w: F64, design: WaterSideDesign, *, limited: bool, full_flow: bool = False
 ) -> tuple[F64, F64, F64]:
     """Return the load of economiser and chiller: the heat of the coils and of the pumps.
 
@@ -242,14 +254,17 @@ def chilled_water_load_w(
         load_w: Heat that the coils remove from the air, W, (B,).
         design: Sized devices.
         limited: True if the working pumps limit the flow, and the range grows instead.
+        full_flow: True if all valves are open, so that the working pumps give all of their flow.
 
     Returns:
         Heat to remove from the chilled water, W, (B,); power of the chilled-water pumps, W, (B,);
         and the chilled-water range at the coils divided by the design range, (B,).
     """
     range_ratio = coil_range_ratio(load_w, design)
-    if limited:
-        range_ratio = np.maximum(range_ratio, load_w / np.maximum(design.pumped_w, LEAST_PUMPED_W))
     flow_w = load_w / range_ratio
+    if limited:
+        at_full_flow = load_w / np.maximum(design.pumped_w, LEAST_PUMPED_W)
+        range_ratio = at_full_flow if full_flow else np.maximum(range_ratio, at_full_flow)
+        flow_w = design.pumped_w if full_flow else load_w / range_ratio
     power_w = loop_pump_w(flow_w, design.cooling_w, design.chilled_pump_w, design)
     return load_w + design.pump_heat_share * power_w, power_w, range_ratio

@@ -30,7 +30,10 @@ A ratio to IT energy is None if there is no IT energy.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -275,6 +278,18 @@ def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
         "hottest_row": rack // fleet.configs[dc].hall.racks_per_row,
         "hottest_server": int(totals.hottest_server[dc]),
     }
+
+
+def without_repeated_pue(names: Sequence[str], metrics: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return names of metrics, but not that of the PUE with losses where the PUE counts them.
+
+    Args:
+        names: Names of metrics.
+        metrics: Metrics of the runs or data centers to print, keyed by name.
+    """
+    pairs = [(of.get("pue"), of.get("pue_with_losses")) for of in metrics]
+    repeats = all(a == b or (a and b and math.isclose(a, b)) for a, b in pairs)
+    return [name for name in names if not (repeats and name == "pue_with_losses")]
 
 
 def _mean_metrics(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.sim.crac_units import Supply
+from sdc_taichi.sim.crac_units import Supply, UnitAir
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import ChilledWater, Coil, Conditions, Hall, HallState, HallSums
 from sdc_taichi.sim.sizing import Sizing
@@ -101,8 +101,8 @@ class TransientAir:
         fleet: B data centers.
         hall: Their halls.
         sizing: Their sized devices.
-        limits_w: Function of surroundings and supply that returns the heat that the plant can
-            remove during a step, and the heat that coils and pumps can carry, in W, (B,) each.
+        limits_w: ``FacilityStage.limits_w``, which returns the heat that the plant can remove and
+            that coils and pumps can carry during a step.
         keep_inlets: True if the placement policy reads the inlet temperatures of the last step.
     """
 
@@ -111,7 +111,7 @@ class TransientAir:
         fleet: Fleet,
         hall: Hall,
         sizing: Sizing,
-        limits_w: Callable[[Surroundings, Supply], tuple[F64, F64]],
+        limits_w: Callable[[Surroundings, Supply, UnitAir], Mapping[str, F64]],
         *,
         keep_inlets: bool,
     ) -> None:
@@ -120,6 +120,7 @@ class TransientAir:
         self._substep_s = fleet.configs[0].simulation.substep_s
         self._room_j_per_k = sizing.room_kwh_per_k * J_PER_KWH
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
+        self._unit_sums, self._unit_m3s = fleet.unit_sums, fleet.unit_design_m3s
         self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
 
     def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
@@ -142,17 +143,35 @@ class TransientAir:
         Raises:
             PhysicalLimitError: Temperatures or power overflow.
         """
-        removable_w, carried_w = self._limits_w(surroundings, supply)
+        speed = np.minimum(np.maximum(state.following, supply.unit_low), supply.unit_high)
         water, tank_share = self._water, surroundings.tank_share
+        j_per_k = water.loop_j_per_k + tank_share * water.mixed_tank_j_per_k
+
+        def warmed_k(room_j: F64, water_j: F64, tank_j: F64) -> F64:
+            of_room = (room_j - water_j - tank_j) / self._room_j_per_k
+            return np.maximum(
+                np.where(j_per_k > 0.0, water_j / np.maximum(j_per_k, 1.0), of_room), 0.0
+            )
+
+        room_j = state.room_heat_kwh * J_PER_KWH
+        at_start_k = warmed_k(room_j, state.water_heat_j, state.tank_heat_j)
+        unit_air = UnitAir(
+            return_c=state.return_air_c,
+            flow_m3s=self._unit_sums(self._unit_m3s * speed),
+            warmed_k=at_start_k,
+        )
+        limits = self._limits_w(surroundings, supply, unit_air)
         coil = Coil(
             setpoint_c=supply.coldest_supply_c,
-            room_j=state.room_heat_kwh * J_PER_KWH,
+            room_j=room_j,
             room_j_per_k=self._room_j_per_k,
-            limit_w=removable_w,
+            limit_w=limits["limit_w"],
+            limit_w_per_k=limits["limit_w_per_k"],
+            limit_w_per_w=limits["limit_w_per_w"],
             fan_w_per_m3s=self._fan_w_per_m3s * surroundings.powered,
             water=ChilledWater(
-                carried_w=carried_w,
-                j_per_k=water.loop_j_per_k + tank_share * water.mixed_tank_j_per_k,
+                carried_w=limits["carried_w"],
+                j_per_k=j_per_k,
                 tank_most_j=water.stratified_tank_j,
                 tank_share=tank_share,
             ),
@@ -166,6 +185,7 @@ class TransientAir:
             self._substep_s,
             shortest_s=SHORTEST_SUBSTEP_S,
         )
+        air.most_warmed_k = np.maximum(at_start_k, warmed_k(air.room_j, air.water_j, air.tank_j))
         return air, {**fields_of(after), "group_inlet_c": self._inlets.last()}
 
 

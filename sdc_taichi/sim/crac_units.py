@@ -50,6 +50,19 @@ class Supply(SetpointQuantities):
     """Full-speed airflow of the running units as a share of the design airflow, at most 1, (B,)."""
 
 
+@dataclass
+class UnitAir:
+    """Air and water of the CRAC units of B data centers at the start of a step."""
+
+    return_c: F64
+    """Temperature of the return air, in C, (B,)."""
+    flow_m3s: F64
+    """Airflow of the units, in m3/s, (B,)."""
+    warmed_k: F64
+    """Temperature of the chilled water, or in halls without water of the room, minus its setpoint,
+    at least 0, in K, (B,)."""
+
+
 class CracUnits:
     """The CRAC units of a fleet.
 

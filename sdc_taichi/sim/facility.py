@@ -21,11 +21,16 @@ from sdc_taichi.plant.battery import (
 )
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, ROUND_OFF_SHARE, overload_kwh
-from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
+from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint, completed
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterPoint
-from sdc_taichi.plant.water_side import coil_capacity_w
-from sdc_taichi.sim.crac_units import Supply
+from sdc_taichi.plant.water_side import (
+    LEAST_PUMPED_W,
+    chilled_water_load_w,
+    coil_capacity_w,
+    warmth_w,
+)
+from sdc_taichi.sim.crac_units import Supply, UnitAir
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.hall_solver import HallSums
 from sdc_taichi.sim.physical_limits import within_limits
@@ -45,6 +50,12 @@ from sdc_taichi.types import (
     fields_of,
     joined,
 )
+
+WARMER_K, LESS_LOAD = 2.0, 0.9
+"""Warmth of water and air, in K, and load divided by capacity, at which the growth of the plant's
+heat is evaluated."""
+VALVE_BAND_K = 1.0
+"""Warmth of the water above its setpoint at which all valves are open, in K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,26 +145,51 @@ class Facility:
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
         self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
 
-    def removable_w(self, surroundings: Surroundings, supply: Supply) -> dict[str, F64]:
+    def removable_w(
+        self, surroundings: Surroundings, supply: Supply, air: UnitAir
+    ) -> dict[str, F64]:
         """Compute the heat that the plant can remove, and that coils and pumps can carry.
+
+        Free cooling removes more heat from warmer water and air. The heat that the plant can remove
+        is therefore ``limit_w`` plus the growths times the warmth of the water and the heat at the
+        coils. Both growths are 0 where the plant can remove all heat that coils and pumps bring.
 
         Args:
             surroundings: Weather and failures.
             supply: Operation of the CRAC units.
+            air: Air and water of the CRAC units at the start of the step.
 
         Returns:
-            ``heat_removed_w`` and ``carried_w``, in W, (B,) each.
+            ``limit_w`` and ``carried_w``, in W, ``limit_w_per_k``, in W/K, and ``limit_w_per_w``,
+            in W/W, (B,) each.
         """
         capacity_w = self._coil_capacity_w(surroundings, supply)
-        flow_m3s = self._sizing.crac_flow_m3s
-        rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
-        return_c = supply.plant_setpoint_c + rise_k
-        plant = self._operate(capacity_w, surroundings, supply, return_c, flow_m3s)
+
+        def plant(load_share: float, warmer_k: float) -> WaterSideResult:
+            return self._operate(
+                load_share * capacity_w,
+                surroundings,
+                supply,
+                air.return_c + warmer_k,
+                air.flow_m3s,
+                air.warmed_k + warmer_k,
+            )
+
+        full, warmer, less = plant(1.0, 0.0), plant(1.0, WARMER_K), plant(LESS_LOAD, 0.0)
+        removed_w = full.heat_removed_w
+        per_k = np.maximum(warmer.heat_removed_w - removed_w, 0.0) / WARMER_K
+        less_w = (1.0 - LESS_LOAD) * capacity_w
+        per_w = (full.economiser_w - less.economiser_w) / np.maximum(less_w, LEAST_PUMPED_W)
         design = self._sizing.water_side
         if not self._event_free:
             design = replace(design, pumped_w=design.pumped_w * surroundings.pump_share)
+        offered_w = capacity_w + self._while_powered(warmth_w(air.warmed_k, design), surroundings)
+        short = removed_w < offered_w * (1.0 - ROUND_OFF_SHARE)
+        per_k, per_w = (np.where(short, np.maximum(x, 0.0), 0.0) for x in (per_k, per_w))
         return {
-            "heat_removed_w": plant.heat_removed_w,
+            "limit_w": removed_w - per_k * air.warmed_k - per_w * capacity_w,
+            "limit_w_per_k": per_k,
+            "limit_w_per_w": per_w,
             "carried_w": np.minimum(
                 capacity_w, self._while_powered(coil_capacity_w(design), surroundings)
             ),
@@ -170,13 +206,16 @@ class Facility:
         """
         it_w = inputs.air.cpu_w + inputs.air.it_fan_w
         air = self._crac_air(inputs, it_w)
-        plant = self._operate(
-            self._requested_w(inputs, air),
-            inputs.surroundings,
-            inputs.supply,
-            air.return_c,
-            air.crac_flow_m3s,
-        )
+        requested_w = self._requested_w(inputs, air)
+        at = inputs.surroundings, inputs.supply, air.return_c, air.crac_flow_m3s
+        plant = self._operate(requested_w, *at)
+        if self._transient:
+            carried_w = np.maximum(self._carried_w(inputs), 0.0)
+            fullest = self._operate(carried_w, *at, inputs.air.most_warmed_k)
+            plant = completed(plant, fullest, requested_w)
+            opened = np.minimum(inputs.air.most_warmed_k / VALVE_BAND_K, 1.0)
+            least_w = opened * fullest.chilled_pump_w
+            plant = self._with_coil_pumps(plant, carried_w, least_w, inputs.surroundings)
         heat = self._balance_heat(inputs, air, plant)
         water = self._use_water(inputs, air, plant)
         energy = self._energy(inputs, it_w, self._hvac_w(air, plant))
@@ -247,6 +286,44 @@ class Facility:
             cooling_load_w=load_w,
         )
 
+    def _carried_w(self, inputs: StepInputs) -> F64:
+        """Return the heat that coils give to the chilled water of transient halls, in W, (B,).
+
+        What the plant does not remove remains in water and tank.
+        """
+        state, air = inputs.state, inputs.air
+        stored_j = air.water_j - state.water_heat_j + (air.tank_j - state.tank_heat_j)
+        return air.coil_w + stored_j / (self._step_h * 3600.0)
+
+    def _with_coil_pumps(
+        self, plant: WaterSideResult, carried_w: F64, least_w: F64, surroundings: Surroundings
+    ) -> WaterSideResult:
+        """Let the pumps carry all heat of the coils, also that which water and tank take up.
+
+        The heat that this gives the water is removed from the hall the less.
+
+        Args:
+            plant: Plant with pumps that carry the heat that it removes.
+            carried_w: Heat of the coils, in W, (B,).
+            least_w: Lowest power of the pumps, with valves open as far as warm water requires, in
+                W, (B,).
+            surroundings: Failures of the step.
+        """
+        design = self._sizing.water_side
+        if self._plant.outdoor_air:
+            carried_w = np.maximum(carried_w - plant.economiser_w, 0.0)
+        if not self._event_free:
+            carried_w = carried_w / np.where(surroundings.powered > 0, surroundings.powered, 1.0)
+            design = replace(design, pumped_w=design.pumped_w * surroundings.pump_share)
+        _, pump_w, _ = chilled_water_load_w(carried_w, design, limited=True)
+        pump_w = np.maximum(self._while_powered(pump_w, surroundings), least_w)
+        more_w = np.maximum(pump_w - plant.chilled_pump_w, 0.0)
+        # The heat of pumps that is not removed is neglected, as in the plants.
+        removed_w = np.maximum(plant.heat_removed_w - design.pump_heat_share * more_w, 0.0)
+        return replace(
+            plant, heat_removed_w=removed_w, chilled_pump_w=plant.chilled_pump_w + more_w
+        )
+
     def _requested_w(self, inputs: StepInputs, air: CracQuantities) -> F64:
         """Return the heat requested from the plant, in W: cooling load plus stored room heat."""
         if self._transient:
@@ -269,8 +346,12 @@ class Facility:
         supply: Supply,
         return_c: F64,
         airflow_m3s: F64,
+        warmed_k: F64 | None = None,
     ) -> WaterSideResult:
-        """Operate the cooling plant, which is off during the share of the step without power."""
+        """Operate the cooling plant, which is off during the share of the step without power.
+
+        With ``warmed_k``, the chilled water is above its setpoint, and its heat is requested too.
+        """
         design = self._sizing.water_side
         if not self._event_free:
             on = np.where(surroundings.powered > 0, surroundings.powered, 1.0)
@@ -281,6 +362,8 @@ class Facility:
                 pumped_w=design.pumped_w * surroundings.pump_share,
                 outdoor_units=surroundings.outdoor_units,
             )
+        if warmed_k is not None:
+            requested_w = requested_w + warmth_w(warmed_k, design)
         point = PlantPoint(
             setpoint_c=supply.plant_setpoint_c,
             water_setpoint_c=supply.water_setpoint_c,
@@ -288,6 +371,7 @@ class Facility:
             airflow_m3s=airflow_m3s,
             outdoor_c=surroundings.outdoor_c,
             wet_bulb_c=surroundings.wet_bulb_c,
+            warmed_k=warmed_k,
         )
         result = self._plant.step(requested_w, point, design, self._devices)
         return result if self._event_free else result.scaled(surroundings.powered)
@@ -458,13 +542,9 @@ class FacilityStage:
         self._step = CompiledStage(lambda **x: _checked_step(facility, **x), fleet.size)
         self._removable = CompiledStage(facility.removable_w, fleet.size)
 
-    def limits_w(self, surroundings: Surroundings, supply: Supply) -> tuple[F64, F64]:
-        """Return the heat that the plant can remove, and that coils and pumps can carry, in a step.
-
-        Both are in W, (B,).
-        """
-        results = self._removable(surroundings=surroundings, supply=supply)
-        return results["heat_removed_w"], results["carried_w"]
+    def limits_w(self, surroundings: Surroundings, supply: Supply, air: UnitAir) -> dict[str, F64]:
+        """Run ``Facility.removable_w``, with its arguments and results."""
+        return self._removable(surroundings=surroundings, supply=supply, air=air)
 
     def step(
         self,

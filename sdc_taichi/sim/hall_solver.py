@@ -116,11 +116,16 @@ class Coil:
     room_j_per_k: F64
     """Heat capacity of the room, in J/K, (B,)."""
     limit_w: F64
-    """Maximum heat that the plant can remove during the step, in W, (B,)."""
+    """Maximum heat that the plant can remove from water at its setpoint, without the part that
+    grows with the heat at the coils, in W, (B,)."""
     fan_w_per_m3s: F64
     """CRAC fan power divided by airflow, both at full speed, in W/(m3/s), (B,)."""
     water: ChilledWater | None = None
     """Chilled water and tank; None for halls without either."""
+    limit_w_per_k: F64 | float = 0.0
+    """Growth of the maximum heat with the warmth of the water above its setpoint, in W/K, (B,)."""
+    limit_w_per_w: F64 | float = 0.0
+    """Growth of the maximum heat with the heat at the coils, in W/W, (B,)."""
 
 
 Precision = Literal["f32", "f64"]
@@ -212,6 +217,9 @@ class HallSums(HallQuantities):
     """Part of ``room_j`` in a stratified tank, in J, (B,)."""
     water_warmed_k: F64
     """Temperature of the chilled water minus its setpoint at the end of the step, in K, (B,)."""
+    most_warmed_k: F64
+    """Temperature of the chilled water, or in halls without water of the room, minus its setpoint,
+    in K, (B,): the higher of the values at start and end of the step."""
 
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
@@ -401,7 +409,8 @@ class Hall:
     def steady_state(self, conditions: Conditions) -> HallState:
         """Return the thermal state of transient halls in equilibrium with constant conditions."""
         self.solve(conditions)
-        for name in ("room_j", "coil_limit_w", "water_j", "tank_j", *_water_rows(None)):
+        plant = ("coil_limit_w", "limit_w_per_k", "limit_w_per_w")
+        for name in ("room_j", *plant, "water_j", "tank_j", *_water_rows(None)):
             self._dc[name][:] = 0.0
         self._dc["room_j_per_k"][:] = 1.0
         server_c = np.zeros(self._fleet.groups, self._dtype)
@@ -671,6 +680,8 @@ class Hall:
             "tank_j": state.tank_heat_j,
             "room_j_per_k": coil.room_j_per_k,
             "coil_limit_w": coil.limit_w,
+            "limit_w_per_k": coil.limit_w_per_k,
+            "limit_w_per_w": coil.limit_w_per_w,
             "crac_fan_w_per_m3s": coil.fan_w_per_m3s,
             **_water_rows(coil.water),
         }
@@ -980,6 +991,7 @@ class Hall:
             )
         else:
             unit_supply_c, cubed_flow_m3s = results["supply_c"], self._no_flow_m3s
+        water_warmed_k = self._dc["water_j"] / np.maximum(self._dc["water_j_per_k"], 1e-30)
         return HallSums(
             unit_supply_c=unit_supply_c.copy(),
             unit_airflow_m3s=unit["flow_m3s"].copy(),
@@ -987,7 +999,8 @@ class Hall:
             room_j=self._dc["room_j"] + (self._dc["water_j"] + self._dc["tank_j"]),
             water_j=self._dc["water_j"].copy(),
             tank_j=self._dc["tank_j"].copy(),
-            water_warmed_k=self._dc["water_j"] / np.maximum(self._dc["water_j_per_k"], 1e-30),
+            water_warmed_k=water_warmed_k,
+            most_warmed_k=water_warmed_k,
             **results,
         )
 
