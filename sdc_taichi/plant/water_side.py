@@ -18,6 +18,8 @@ CYCLING_BELOW = 0.05
 """Heat of a water loop divided by its design heat below which its pumps cycle on and off."""
 LEAST_PUMPED_W = 1e-3
 """Lower bound of the heat that the pumps can carry in equations that divide by it, in W."""
+LEAST_RANGE = 1e-6
+"""Lower bound of the range of chilled water at full flow, divided by the design range."""
 LEAST_OUTDOOR_UNITS = 0.01
 """Lower bound of the share of outdoor units in equations that divide by it."""
 
@@ -264,7 +266,7 @@ def chilled_water_load_w(
     flow_w = load_w / range_ratio
     if limited:
         at_full_flow = load_w / np.maximum(design.pumped_w, LEAST_PUMPED_W)
-        range_ratio = at_full_flow if full_flow else np.maximum(range_ratio, at_full_flow)
+        range_ratio = np.maximum(LEAST_RANGE if full_flow else range_ratio, at_full_flow)
         flow_w = design.pumped_w if full_flow else load_w / range_ratio
     power_w = loop_pump_w(flow_w, design.cooling_w, design.chilled_pump_w, design)
     return load_w + design.pump_heat_share * power_w, power_w, range_ratio
