@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi import Actions, ConfigError, Simulator, drivers_from_arrays, load_config
+from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import row_index
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
@@ -342,6 +343,51 @@ def test_a_unit_passes_its_own_return_air_while_it_is_down_and_after_its_restart
     for _, state in found["common"][3:6]:
         np.testing.assert_array_equal(state.return_air_c, state.return_air_c[0])
     np.testing.assert_allclose(found["own"][11][0].unit_supply_c, 23.0, atol=0.05)
+
+
+def near_and_far(fleet: Fleet, unit: int) -> tuple[Any, Any]:
+    """True for the fifth of the racks nearest to a unit, and for the fifth farthest from it."""
+    plan = floor_plan(fleet.configs[0].hall)
+    place_m = unit_places_m(plan, fleet.units)[unit]
+    distance_m = np.hypot(*(plan.front_m - place_m).T)
+    return distance_m <= np.quantile(distance_m, 0.2), distance_m >= np.quantile(distance_m, 0.8)
+
+
+@pytest.mark.parametrize("unit", [0, 3])
+def test_a_lost_unit_warms_the_racks_near_it_most(unit: int) -> None:
+    """At constant speeds nothing replaces its air; coupling leaves the lack of air near it."""
+    runs = np.ones(6)
+    runs[unit] = 0.0
+    spread_k = {}
+    for coupling in (0.75, 0.0):
+        warmer_k = []
+        for running in (np.ones(6), runs):
+            speed = np.where(running > 0, 0.6, 0.1)
+            fleet, _, result = solved(
+                "hall_of_2026", speed, *coupled(coupling, 4.0), running=running, load=0.9
+            )
+            warmer_k.append(result.rack_inlet_c)
+        near, far = near_and_far(fleet, unit)
+        change_k = warmer_k[1] - warmer_k[0]
+        spread_k[coupling] = change_k[near].mean(), change_k[far].mean()
+    coupled_k, fixed_k = spread_k[0.75], spread_k[0.0]
+    assert coupled_k[0] > 1.3 * coupled_k[1] > 0.0
+    assert coupled_k[0] - coupled_k[1] > 1.5 * (fixed_k[0] - fixed_k[1])
+
+
+def test_more_air_of_one_unit_cools_its_racks() -> None:
+    speed = np.full(6, 0.75)
+    faster = speed.copy()
+    faster[2] = 1.0
+    for coupling in (0.0, 0.75):
+        inlets_c = [
+            solved("hall_of_2026", s, *coupled(coupling, 4.0), "hall.layout.containment=0.5")
+            for s in (speed, faster)
+        ]
+        near, far = near_and_far(inlets_c[0][0], 2)
+        change_k = inlets_c[1][2].rack_inlet_c - inlets_c[0][2].rack_inlet_c
+        assert change_k[near].mean() < -0.25
+        assert change_k[near].mean() < 1.4 * change_k[far].mean() < 0.0
 
 
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
