@@ -155,9 +155,11 @@ class TransientAir:
 
         room_j = state.room_heat_kwh * J_PER_KWH
         at_start_k = warmed_k(room_j, state.water_heat_j, state.tank_heat_j)
+        flow_m3s = self._unit_sums(self._unit_m3s * speed)
+        returned = self._unit_sums(self._unit_m3s * speed * state.return_air_c)
         unit_air = UnitAir(
-            return_c=state.return_air_c,
-            flow_m3s=self._unit_sums(self._unit_m3s * speed),
+            return_c=returned / np.maximum(flow_m3s, 1e-30),
+            flow_m3s=flow_m3s,
             warmed_k=at_start_k,
         )
         limits = self._limits_w(surroundings, supply, unit_air)
