@@ -364,7 +364,7 @@ def test_a_lost_unit_warms_the_racks_near_it_most(unit: int) -> None:
         for running in (np.ones(6), runs):
             speed = np.where(running > 0, 0.6, 0.1)
             fleet, _, result = solved(
-                "hall_of_2026", speed, *coupled(coupling, 4.0), running=running, load=0.9
+                "hall_of_2026", speed, OWN, *coupled(coupling, 4.0), running=running, load=0.9
             )
             warmer_k.append(result.rack_inlet_c)
         near, far = near_and_far(fleet, unit)
