@@ -75,8 +75,9 @@ class RecordingOptions:
         str | None,
         typer.Option(
             metavar="RACK|row:ROW|hottest:COUNT|...",
-            help="Racks whose trends are recorded, separated by commas: numbers, ROW:PLACE, "
-            "row:ROW, zone:ZONE, hottest:COUNT, median. [default: hottest:10,median]",
+            help="Racks whose history is written to racks.parquet, and whose trends are recorded, "
+            "separated by commas: numbers, ROW:PLACE, row:ROW, zone:ZONE, hottest:COUNT, median. "
+            "[default: none in racks.parquet, hottest:10,median in a recording]",
         ),
     ] = None
     inlet_range: Annotated[
@@ -115,7 +116,6 @@ class RecordingOptions:
                 "--focus": self.focus,
                 "--every": self.every,
                 "--against": self.against,
-                "--racks": self.racks,
                 "--inlet-range": self.inlet_range,
             }
             for name, value in only_recorded.items():
@@ -179,6 +179,15 @@ def simulate_command(
     out: Annotated[
         Path | None, out_option("Output folder. [default: runs/PRESET-SITES-START]", "DIR")
     ] = None,
+    rack_history: Annotated[
+        str | None,
+        typer.Option(
+            metavar="every=TIME[,unit-shares]",
+            help="Write temperatures, power and airflow of racks (--racks, or all) to "
+            "racks.parquet, as means of a TIME such as 15min, 1h or step; unit-shares adds the "
+            "CRAC units that supply each rack.",
+        ),
+    ] = None,
     recording: RecordingOptions,
     force: FolderForce = False,
     quiet: Quiet = False,
@@ -195,6 +204,7 @@ def simulate_command(
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
     from sdc_taichi.run.optimum_folder import FOLDER, write_optimum
+    from sdc_taichi.run.rack_history import RACK_HISTORY_FILE, check_history, history_request
     from sdc_taichi.sim.events import require_events_start_before
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
@@ -207,12 +217,15 @@ def simulate_command(
     require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
     objective = None if optimum is None else Objective.parse(optimum)
+    history = history_request(recording.racks, rack_history)
     recorder = recording.recorder()
     folder = out if out is not None else _default_folder(label, configs)
     with Simulator(fleet, precision=run.precision) as sim:
         print_notes(sim.drivers.notes)
         with interruptible() as interrupted, _recorded(recorder, sim, request) as record_step:
             prepare_folder(folder, force=force)
+            if history is not None:
+                check_history(history, fleet, steps, folder)
             best = (
                 None
                 if objective is None
@@ -232,6 +245,7 @@ def simulate_command(
                     request,
                     folder,
                     force=force,
+                    history=history,
                     optimum=best,
                     on_step=after_step,
                     stop=interrupted,
@@ -248,6 +262,9 @@ def simulate_command(
                 print(metrics_json(metrics))
             elif not quiet:
                 print_summary(metrics, label, folder, fleet.steps_per_hour)
+                if history is not None:
+                    file = folder / RACK_HISTORY_FILE
+                    print(f"Racks: {printable(file)} ({file.stat().st_size / 1e6:.3g} MB)")
                 _print_recording(recorder)
             _serve_until_interrupted(recorder, interrupted)
     if not is_whole:

@@ -1,14 +1,15 @@
 """Simulation of a run and writer of its run folder.
 
 A run folder contains ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
-``configs.yaml`` (several, one YAML document each). Every file is written under a temporary name and
-renamed when it is complete; while a run writes, a second run into the folder is refused. Equal runs
-produce identical bytes on processors with the same features. See docs/run-folder.md for the
-columns.
+``configs.yaml`` (several, one YAML document each), and on request ``racks.parquet``. Every file is
+written under a temporary name and renamed when it is complete; while a run writes, a second run
+into the folder is refused. Equal runs produce identical bytes on processors with the same features.
+See docs/run-folder.md for the columns.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -26,6 +27,12 @@ from sdc_taichi.run.achievable import achievement, begin_score, put_beside
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Totals, empty_totals, metrics_of_fleet, metrics_per_dc
+from sdc_taichi.run.rack_history import (
+    RACK_HISTORY_FILE,
+    HistoryRequest,
+    RackHistoryWriter,
+    check_history,
+)
 from sdc_taichi.run.steps_file import STEPS_FILE, StepsWriter
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
@@ -49,6 +56,7 @@ def simulate_to_folder(
     out: Path,
     *,
     force: bool = False,
+    history: HistoryRequest | None = None,
     optimum: Optimum | None = None,
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
@@ -61,6 +69,7 @@ def simulate_to_folder(
         request: Steps, seed, forecast errors and name of the controller.
         out: Folder of the run, created if necessary; files of an earlier run are replaced.
         force: True allows a folder that contains other files.
+        history: Requested history of racks, written to racks.parquet; None writes none.
         optimum: Known optimum of the same configs, inputs and steps, with which metrics.json
             compares the run; a run that ends early is not compared.
         on_step: Callback that receives the result of every step.
@@ -74,10 +83,13 @@ def simulate_to_folder(
     Raises:
         PhysicalLimitError: A result is physically impossible; the files contain the steps before.
         SdcError: The folder contains other files, another run is writing to it, a file cannot be
-            written, or an action of the controller is not valid.
+            written, the requested history does not fit the halls or the disk, or an action of the
+            controller is not valid.
     """
     sim.fleet.require_distinct_names()
     prepare_folder(out, force=force)
+    if history is not None:
+        check_history(history, sim.fleet, request.steps, out)
     description = describe_run(sim, request)
     configs = configs_yaml(sim.fleet.configs)
     names = ["config.yaml", "configs.yaml"]
@@ -87,7 +99,13 @@ def simulate_to_folder(
     events: dict[ActiveEvent, None] = {}
     # The open temporary file is a lock that keeps a second run out of the folder.
     metrics_file = AtomicFile(out / METRICS_FILE)
-    with metrics_file, StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
+    with contextlib.ExitStack() as files:
+        files.enter_context(metrics_file)
+        writer = files.enter_context(StepsWriter(out / STEPS_FILE, sim, metadata))
+        racks = None
+        if history is not None:
+            path = out / RACK_HISTORY_FILE
+            racks = files.enter_context(RackHistoryWriter(path, sim, history, description))
         # Check again, because another run may have finished here before the lock was taken.
         has_former_run = prepare_folder(out, force=force)
 
@@ -95,6 +113,8 @@ def simulate_to_folder(
 
         def write_step(result: StepResult) -> None:
             writer.add(result)
+            if racks is not None:
+                racks.add(result)
             if score is not None:
                 score.add(result)
             events.update(dict.fromkeys(sim.active_events(result.step)))
@@ -122,9 +142,12 @@ def simulate_to_folder(
         if totals.steps == 0:
             return None
         writer.commit()
+        if racks is not None:
+            racks.commit()
         write_text(out / config_name, configs)
         if has_former_run:
-            for name in (other_name, REPORT_FILE, OPTIMUM_FILE):
+            former = () if racks is not None else (RACK_HISTORY_FILE,)
+            for name in (other_name, REPORT_FILE, OPTIMUM_FILE, *former):
                 with naming_errors(out / name):
                     (out / name).unlink(missing_ok=True)
         content = _metrics_content(description, totals, sim.fleet, events)
@@ -222,7 +245,7 @@ def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[st
 
 def _is_left_by_broken_run(path: Path) -> bool:
     """Return True for a file that a run can leave behind if it ends before writing metrics.json."""
-    names = (STEPS_FILE, REPORT_FILE, OPTIMUM_FILE)
+    names = (STEPS_FILE, RACK_HISTORY_FILE, REPORT_FILE, OPTIMUM_FILE)
     return path.name in names or path.suffix in (".part", ".rrd")
 
 
