@@ -27,7 +27,8 @@ WATER_J_PER_M3_K = 4.19e6
 """Volumetric heat capacity of water, in J/(m3 K)."""
 STRATIFIED_SHARE = 0.9
 """Share of the water of a stratified tank that leaves it at the supply temperature, or figure of
-merit: 0.85..0.95 for tanks in service (Bahnfleth, Musser 1998, ASHRAE Trans. 104(2))."""
+merit: up to 0.9 in measurements (Karim 2009, Performance evaluation of a stratified chilled-water
+thermal storage system)."""
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
 """Design dry bulbs of the released SustainDC, in C, by the first two letters of the site; 50 C for
 all other sites."""
