@@ -611,6 +611,23 @@ def test_voxels_stand_where_the_racks_do() -> None:
     assert not {tuple(c) for c in grid.front} & {tuple(c) for c in grid.back}
 
 
+def test_large_3d_halls_show_the_hottest_of_adjacent_racks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hall_rasters, "MAX_HALL_PARTS", 400)
+    with Simulator(load_config("large")) as sim:
+        sim.reset()
+        cadence = recording_blocks.choose_cadence(sim.fleet, [0], None)
+        builder = recording_blocks.BlockBuilder(sim, [0], cadence)
+        result = sim.step()
+        builder.add(result, None)
+    rows = result.rack_inlet_max_c.reshape(50, 20)
+    expected = np.stack([rows[:, i : i + 3].max(axis=1) for i in range(0, 20, 3)], axis=1)
+    (inlets,) = builder.take().halls["inlet"]
+    np.testing.assert_array_equal(inlets, expected.reshape(-1).astype(np.float32))
+    grid = hall_rasters.rack_voxels(sim.fleet.configs[0].hall, 1)
+    assert len({tuple(index) for index in grid.front}) == len(inlets) == 350
+    assert grid.size_m[0] == pytest.approx(3 * 0.6)
+
+
 def small(count: int = 1) -> Simulator:
     return Simulator(make_configs(load_config("tiny"), count=count))
 

@@ -17,6 +17,8 @@ MAX_RACKS_WITH_GAPS = 5_000
 """Largest number of racks at which the tiles of a heat map have gaps between them."""
 MAX_NAMED_RACKS = 20_000
 """Largest number of racks of a hall whose maps name every rack; larger ones name the rows."""
+MAX_HALL_PARTS = 20_000
+"""Largest number of racks of a 3D hall that has a voxel for the front of each rack."""
 MAX_RACKS_OF_SMALL_HALL = 200
 """Largest number of racks at which a hall has tiles of full size and all levels in 3D."""
 
@@ -126,8 +128,18 @@ def colour_bar(scale: ColourScale) -> tuple[Classes, list[float]]:
     return gradient, [i * interval for i in range(begin, end + 1)]
 
 
+def voxel_starts(hall: HallConfig) -> I64:
+    """Return the first rack of each part of the 3D hall, (parts,).
+
+    A part is a rack, or some adjacent racks of a row in halls of more than ``MAX_HALL_PARTS``.
+    """
+    together = -(-hall.racks // MAX_HALL_PARTS)
+    row_starts = np.arange(hall.rows)[:, None] * hall.racks_per_row
+    return np.asarray(row_starts + np.arange(0, hall.racks_per_row, together)).reshape(-1)
+
+
 class RackVoxels(NamedTuple):
-    """Racks as voxels of half a rack's depth: a front and a back voxel per level of each rack.
+    """Racks as voxels of half a rack's depth: a front and a back voxel per level of each part.
 
     All voxels are on one grid, which rounds the widths of aisles to half a rack's depth.
     """
@@ -135,9 +147,9 @@ class RackVoxels(NamedTuple):
     size_m: tuple[float, float, float]
     """Size of a voxel along the row, across the row and upwards, in m."""
     front: I64
-    """Grid indices x, y, z of front voxels, rack by rack from the floor up, (R * levels, 3)."""
+    """Grid indices x, y, z of front voxels, part by part from the floor up, (parts * levels, 3)."""
     back: I64
-    """Grid indices x, y, z of back voxels, rack by rack from the floor up, (R * levels, 3)."""
+    """Grid indices x, y, z of back voxels, part by part from the floor up, (parts * levels, 3)."""
     levels: int
     """Number of levels of equal height per rack."""
 
@@ -151,10 +163,11 @@ def rack_voxels(hall: HallConfig, levels: int) -> RackVoxels:
     """
     plan, measures = floor_plan(hall), hall.layout
     half_m = measures.rack_depth_m / 2
-    x = np.tile(np.arange(hall.racks_per_row), hall.rows)
-    low = np.rint((plan.centre_m[:, 1] - half_m) / half_m).astype(np.int64)
+    starts, together = voxel_starts(hall), -(-hall.racks // MAX_HALL_PARTS)
+    x = starts % hall.racks_per_row // together
+    low = np.rint((plan.centre_m[starts, 1] - half_m) / half_m).astype(np.int64)
     # The front is the half with larger y in racks that face towards larger y.
-    ahead = (plan.facing > 0).astype(np.int64)
+    ahead = (plan.facing[starts] > 0).astype(np.int64)
     z = np.arange(levels)
 
     def indices(y: I64) -> I64:
@@ -162,7 +175,7 @@ def rack_voxels(hall: HallConfig, levels: int) -> RackVoxels:
         return np.stack(columns, axis=-1).reshape(-1, 3)
 
     return RackVoxels(
-        size_m=(measures.rack_pitch_m, half_m, measures.rack_height_m / levels),
+        size_m=(measures.rack_pitch_m * together, half_m, measures.rack_height_m / levels),
         front=indices(low + ahead),
         back=indices(low + 1 - ahead),
         levels=levels,

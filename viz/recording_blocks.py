@@ -80,7 +80,7 @@ def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) 
     map_in_events = every_steps or max(1, round(map_every_h * per_hour / MAPS_IN_EVENTS))
     hall_every = every_steps or max(map_every, round(HALL_EVERY_H * per_hour))
     in_events = every_steps or max(map_in_events, round(HALL_EVERY_H_IN_EVENTS * per_hour))
-    has_servers = fleet.servers <= MAX_SERVERS_IN_LEVELS
+    has_servers = fleet.servers <= MAX_SERVERS_IN_LEVELS and racks <= rasters.MAX_HALL_PARTS
     is_small = racks <= rasters.MAX_RACKS_OF_SMALL_HALL
     most_levels = SMALL_HALL_LEVELS if is_small else LARGE_HALL_LEVELS
     levels = tuple(
@@ -184,8 +184,13 @@ class BlockBuilder:
             """Index into the servers in focus of the first server of each level of each rack."""
         shapes = [rasters.tile_grid(fleet.configs[dc].hall).image_shape for dc in focus]
         self._map_bytes = len(MAP_QUANTITIES) * sum(map(math.prod, shapes))
-        racks = np.diff(fleet.rack_offsets)[self._focus]
-        ends = np.cumsum([0, *(racks * cadence.levels)]).tolist()
+        starts = [rasters.voxel_starts(fleet.configs[dc].hall) for dc in focus]
+        self._voxel_starts = np.concatenate(
+            [racks.start + first for racks, first in zip(self.racks, starts, strict=True)]
+        )
+        """Index into the racks in focus of the first rack of each part of the 3D halls."""
+        parts_of_dc = np.array([len(first) for first in starts])
+        ends = np.cumsum([0, *(parts_of_dc * cadence.levels)]).tolist()
         self.levels = list(itertools.starmap(slice, itertools.pairwise(ends)))
         """Slice of each data center in focus in the array of the levels of all racks in focus."""
         self.reward_names: tuple[str, ...] | None = None
@@ -431,6 +436,7 @@ class BlockBuilder:
             values = np.maximum.reduceat(layers, self._level_starts, axis=-1)
         else:
             values = np.stack([result.rack_inlet_max_c, result.rack_outlet_c])[:, self._pick_racks]
+            values = np.maximum.reduceat(values, self._voxel_starts, axis=-1)
         self._halls.append(values.astype(np.float32))
         self._bytes += 4 * values.size
         self._hall_steps.append(result.step)

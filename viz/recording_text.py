@@ -21,6 +21,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, QUANTITIES, Reals, Status
 
 from .colour_scales import ColourScale
+from .hall_rasters import MAX_HALL_PARTS
 from .recording_series import FIELD_ROWS
 
 if TYPE_CHECKING:
@@ -371,7 +372,10 @@ def _steps_text(steps: int) -> str:
 def _levels_text(cadence: Cadence) -> str:
     """Return a text about which temperatures front and back of a rack of the 3D hall show."""
     if not cadence.has_servers:
-        return "of its servers, its back the mean outlet"
+        return (
+            "of its servers, its back the mean outlet (in halls of more than "
+            f"{MAX_HALL_PARTS:,} racks the hottest of some adjacent racks)"
+        )
     return f"at each of {_count_text(max(cadence.levels), 'height')}, its back the hottest outlet"
 
 
