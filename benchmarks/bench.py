@@ -376,6 +376,46 @@ def recording(quick: bool) -> Iterator[Figure]:
         yield Figure("recording", f"{name}, {days} days", ratio, at_most=1.6, absolute=beside)
 
 
+def large_recording(quick: bool) -> Iterator[Figure]:
+    """A recorded day of a very large hall, in which a CRAC unit fails."""
+    from sdc_taichi.viz.recorder import Recorder
+
+    rows, per_row = (50, 50) if quick else (320, 320)
+    config = sdc_taichi.load_config(
+        "large",
+        [
+            f"hall.rows={rows}",
+            f"hall.racks_per_row={per_row}",
+            "hvac.crac.units=64",
+            "events.scheduled=[{kind: crac_down, unit: 9, start_h: 14, duration_h: 3}]",
+        ],
+    )
+    step_count = 96
+    step_s, record_s = np.zeros(step_count), np.zeros(step_count)
+    with tempfile.TemporaryDirectory() as folder, sdc_taichi.Simulator(config) as sim:
+        file = Path(folder, "run.rrd")
+        sim.reset()
+        with Recorder(file) as recorder:
+            recorder.begin(sim)
+            for step in range(step_count):
+                begin = time.thread_time()
+                result = sim.step()
+                between = time.thread_time()
+                recorder.add(result)
+                step_s[step] = between - begin
+                record_s[step] = time.thread_time() - between
+        size_kb = file.stat().st_size / 1e3 / step_count
+    name = f"{rows * per_row:,} racks, a day"
+    ratio = 1.0 + float(record_s.sum() / step_s.sum())
+    beside = f"{number(float(record_s.mean()) * 1e3)} ms/step"
+    yield Figure("recording", name, ratio, at_most=2.0, absolute=beside)
+    slowest = f"{name}, slowest step over a mean step without recording"
+    beside = f"{number(float(record_s.max()) * 1e3)} ms"
+    ratio = float(record_s.max() / step_s.mean())
+    yield Figure("recording", slowest, ratio, at_most=12.0, absolute=beside)
+    yield Figure("recording", f"{name}, file per step", size_kb, "kB", at_most=20.0)
+
+
 def simulated(
     count: int, days: int, file: Path | None, made: contextlib.ExitStack
 ) -> Callable[[], None]:
@@ -502,7 +542,7 @@ def main() -> None:
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
     parts = environments, planned, kernel_and_peer, halls, calls, scaling, starting, optima
-    for part in (*parts, recording):
+    for part in (*parts, recording, large_recording):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

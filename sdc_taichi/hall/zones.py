@@ -16,7 +16,7 @@ from sdc_taichi.types import F64, I64, Reals
 
 RACKS_PER_ZONE = 100
 """Smallest mean number of racks of a zone, except that a hall has at least one zone."""
-MOST_ZONES = 32
+MOST_ZONES = 24
 """Largest number of zones of a hall."""
 
 
