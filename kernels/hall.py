@@ -87,6 +87,7 @@ from .units import (
     keep_supply,
     run_coils,
     run_crac_units,
+    set_present_shares,
     set_supply,
     sum_unit_needs,
     weigh_units,
@@ -439,6 +440,9 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
     hottest = no_hottest(hall)
     while sweeps_left > 0 and dc.status == RUNNING:
         sweep = describe_sweep(hall, n, slice_at, exchanges_after, reference_c)
+        if ti.static(hall.recirculates):
+            if dc.shares_due > 0.0 or dc.exceeds > 0.0:
+                set_present_shares(hall, n, first_chunk, end_chunk)
         if ti.static(hall.transient and hall.recirculates):
             blow_out_casings(hall, n)
         for chunk_at in range(first_chunk, end_chunk):

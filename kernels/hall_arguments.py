@@ -83,8 +83,6 @@ DC_INTS = {
     "supply_rows": "number of supply temperatures in the table (dense halls)",
     "modes": "number of modes, and of sampled racks (sparse halls)",
     "first_sample": "first entry in sample_outlet_c (sparse halls)",
-    "first_fan_knee": "first knee of the airflow ratio of the servers",
-    "first_cpu_knee": "first knee of the power ratio of the servers, after the last of the airflow",
 }
 KNEES = {
     "inlet_c": "inlet above which the slope is another, C",
@@ -110,6 +108,7 @@ RACK_INPUTS = {
     "strength": "weight of the exhaust: design airflow divided by the hall's mean",
     "per_strength": "reciprocal of strength",
     "exhaust_share": "share of exhaust in the intake at the design point, r of docs/hall.md",
+    "present_exhaust_share": "exhaust_share at the present excess of supply (if units exceed)",
     "per_server": "reciprocal of the rack's number of servers, 0 in padding",
 }
 GROUP_INPUTS = {
@@ -174,7 +173,7 @@ DC_DOUBLES = {
     "coupling": "exponent of the weights of the units in their shares, 0 for shares that are fixed",
     "follows_need": "1 if fans deliver what racks need, 0 if their speed is given",
     "weighs": "1 if the weight of a unit differs from 1 in the next sweep",
-    "weighs_used": "value of weighs in the last sweep",
+    "shares_due": "1 if strengths have changed since unit_shares were set",
     "oversupply": "decay of the exhaust shares per excess of supply over need",
     "own_return": "1 if each unit draws its own return air, 0 if all draw that of the hall",
     "exceeds": "1 if a unit delivers more than its racks need, and thus lowers exhaust shares",
@@ -269,8 +268,7 @@ TERMS = {
 }
 """Sums over the blocks of a chunk, separately for each lane."""
 BLOCK_TERMS = {
-    "fresh_m3s": "supply air intake of the servers if units covered all need, m3/s; divided by the "
-    "sum of share times strength of the units",
+    "fresh_m3s": "supply air intake of the servers if units covered all need, m3/s",
     "plain_m3s": "the same at the exhaust shares of the design point, m3/s (if units exceed)",
     "mixed_c": "mean temperature of recirculated air in the substep, C (transient)",
     "parcel_w": "heat that warms the recirculated air in the substep, W (transient)",
@@ -345,6 +343,8 @@ ARGUMENTS = {
     "recirculates": Argument("template"),  # True if racks take in exhaust air
     "transient": Argument("template"),  # True if each sweep is a substep
     "own_return": Argument("template"),  # True if units of a data center draw their own return air
+    "fan_knees": Argument("template"),  # number of knees of the airflow ratio per data center
+    "cpu_knees": Argument("template"),  # number of knees of the power ratio per data center
     "serial": Argument("template"),  # True: run on the calling thread alone
     "slices": Argument("i32"),  # number of parts, one thread each
     "one": Argument("i32"),  # always 1, see "Loops of step 1" in README.md
@@ -371,7 +371,7 @@ ARGUMENTS = {
     "group_inputs": _vectors(1, GROUP_INPUTS, "groups"),
     "unit_inputs": _numbers("real", 2, UNIT_INPUTS, "units"),
     "group_load": _numbers("real", 1),  # utilisation of each group, if given per group
-    "unit_shares": _vectors(1),  # share of each unit in a rack's supply, s of docs/hall.md
+    "unit_shares": _vectors(1),  # present share of each unit in a rack's supply, s of docs/hall.md
     "mix_weights": _vectors(1, lanes=DENSE_LANES * LANES),  # of dense halls
     "run_weights": _vectors(1, lanes=RUN_LANES),  # of sparse halls
     "steady_states": _vectors(1),  # patterns or modes of each hall, and what gives their amounts
@@ -392,7 +392,7 @@ ARGUMENTS = {
     "mode_amount": _numbers("real", 1),  # the memory of mode_amounts, by mode
     "unit_need_m3s": _numbers("f64", 1),  # supply air that a chunk demands from each unit
     "unit_plain_m3s": _numbers("f64", 1),  # the same at the exhaust shares of the design point
-    "plenum_shares": _lanes("f64", 1),  # unit_shares in f64, of halls whose units are coupled
+    "plenum_shares": _lanes("f64", 1),  # unit_shares of units with equal weights, if coupled
     "plenum_need": _lanes("f64", 2, PLENUM_NEED, "plenum"),
     "return_shares": _lanes("f64", 1),  # share of each unit in a rack's returns, q of docs/hall.md
     "return_air": _lanes("f64", 2, RETURN_AIR, "returns"),

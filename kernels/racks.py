@@ -122,7 +122,7 @@ def compute_block(
         block.captured_m3s = captured_m3s
         if ti.static(hall.own_return):
             store_return(hall, n, block_at, air.cover * fresh_m3s, return_m3k_s)
-        store_need(hall, n, block_at, block_terms_at, racks, air, sums, fresh_m3s)
+        store_need(hall, n, block_at, block_terms_at, racks, sums, fresh_m3s)
         exhaust_c = outlet_c
         if ti.static(hall.transient):
             # Air at inlet temperature passes a rack that is off, except for a small draught.
@@ -164,7 +164,6 @@ def store_need(
     block_at,
     block_terms_at,
     racks: ti.template(),
-    air: ti.template(),
     sums: ti.template(),
     fresh_m3s,
 ):
@@ -173,8 +172,8 @@ def store_need(
     plain_m3s = fresh_m3s
     if dc.exceeds > 0.0:
         plain_m3s = sums.flow_m3s - block.exhaust_share * (sums.height_m3s * racks.full_m3s)
-        block_terms.plain_m3s = plain_m3s * air.per_total
-    block_terms.fresh_m3s = fresh_m3s * air.per_total
+        block_terms.plain_m3s = plain_m3s
+    block_terms.fresh_m3s = fresh_m3s
     if dc.coupling > 0.0 and dc.follows_need > 0.0:
         need_m3s = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
         for i in range(LANES):

@@ -58,6 +58,13 @@ def server_model(hall: ti.template(), n):
     elif exponent != hall.real(1.0):
         at_full = ti.pow(per_reference, exponent)
     air_j_per_m3_k = dc.air_j_per_m3_k
+    n_knees = ti.static(hall.fan_knees + hall.cpu_knees)
+    none = ti.Vector([hall.real(0.0)] * ti.static(max(n_knees, 1)))
+    knee_c, knee_slope, knee_shift = none, none, none
+    for k in ti.static(range(n_knees)):
+        knee = hall.knees[n * n_knees + k]
+        knee_c[k], knee_slope[k] = knee.inlet_c, knee.slope_per_k
+        knee_shift[k] = knee.shift_per_k
     return ti.Struct(
         utilisation=hall.zeros + ti.cast(dc.utilisation, hall.real),
         cpu_slope=dc.cpu_slope_per_k,
@@ -72,10 +79,10 @@ def server_model(hall: ti.template(), n):
         fan_full_w=dc.fan_reference_w * at_full,
         full_m3s=dc.fan_full_m3s,
         curve_limit_c=hall.zeros + dc.curve_limit_c,
-        # The knees of power follow those of the airflow ratio.
-        first_fan_knee=dc.first_fan_knee,
-        first_cpu_knee=dc.first_cpu_knee,
-        end_knee=hall.dcs[n + 1].first_fan_knee,
+        # Knees of the airflow ratio, then those of power.
+        knee_c=knee_c,
+        knee_slope=knee_slope,
+        knee_shift=knee_shift,
         air_j_per_m3_k=air_j_per_m3_k,
         per_air=hall.real(1.0) / air_j_per_m3_k,
         # Heat that the air takes up per airflow and K of server minus inlet temperature.
@@ -99,51 +106,31 @@ def intake_air(hall: ti.template(), n, block_at, mixed_c, of_last: ti.template()
     """Return the intake air of the racks of a block, from the exhaust mix before them in C.
 
     With inlet model ``approach`` it is supply air plus the rack's approach temperature. With
-    ``recirculation`` it is T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix). Weights of
-    the units change the shares to s_jk u_k / sum_l s_jl u_l, and units that deliver more than
-    their racks need lower r_j to r_j exp(-kappa max(0, eta_j - 1)) with eta_j = sum_k s_jk eta_k.
+    ``recirculation`` it is T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix), with the
+    present shares s_jk and r_j of ``set_present_shares``.
     ``of_last``: the last sweep had this intake air; otherwise the present sweep has it.
     """
     block, dc = hall.blocks[block_at], hall.dcs[n]
     unit_0 = dc.first_unit
     cover, fresh_k, exhaust_share = hall.zeros, hall.zeros, hall.zeros
-    per_total = hall.zeros + hall.real(1.0)
     if ti.static(hall.recirculates):
-        exhaust_share = block.exhaust_share
-        n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_at(hall, n, block_at)
-        weighs, exceeds = dc.weighs > 0.0, dc.exceeds > 0.0
+        exceeds = dc.exceeds
         if ti.static(of_last):
-            weighs, exceeds = dc.weighs_used > 0.0, dc.exceeds_used > 0.0
-        total, supply_ratio, unit = hall.zeros, hall.zeros, 0
+            exceeds = dc.exceeds_used
+        exhaust_share = block.exhaust_share
+        if exceeds > 0.0:
+            exhaust_share = block.present_exhaust_share
+        n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_at(hall, n, block_at)
+        unit = 0
         while unit < n_units:
             at = unit_0 + unit
-            share, f = hall.unit_shares[share_0 + unit], hall.units[at].fresh_ratio
+            f = hall.units[at].fresh_ratio
             if ti.static(of_last):
                 f = hall.units[at].fresh_ratio_used
-            if weighs:
-                strength = hall.units[at].strength
-                if ti.static(of_last):
-                    strength = hall.units[at].strength_used
-                share *= ti.cast(strength, hall.real)
-                total += share
-            part = share * ti.cast(f, hall.real)
+            part = hall.unit_shares[share_0 + unit] * ti.cast(f, hall.real)
             cover += part
             fresh_k += part * ti.cast(hall.units[at].supply_c, hall.real)
-            if exceeds:
-                ratio = hall.units[at].supply_ratio
-                if ti.static(of_last):
-                    ratio = hall.units[at].supply_ratio_used
-                supply_ratio += share * ti.cast(ratio, hall.real)
             unit += hall.one
-        if weighs:
-            # Padding has no shares.
-            per_total = per_total / larger(total, hall.zeros + hall.real(1e-30))
-            cover *= per_total
-            fresh_k *= per_total
-            supply_ratio *= per_total
-        if exceeds:
-            excess = larger(supply_ratio - hall.real(1.0), hall.zeros)
-            exhaust_share *= hall.exp_of(excess * ti.cast(-dc.oversupply, hall.real))
         fresh_k = fresh_k - cover * mixed_c
     else:
         mixed_c = block.approach_k + ti.cast(hall.units[unit_0].supply_c, hall.real)
@@ -151,7 +138,6 @@ def intake_air(hall: ti.template(), n, block_at, mixed_c, of_last: ti.template()
         mixed_c=mixed_c,
         # sum_k s_jk f_k.
         cover=cover,
-        per_total=per_total,
         exhaust_share=exhaust_share,
         # sum_k s_jk f_k (T_sup,k - T_mix).
         fresh_k=fresh_k,
@@ -217,16 +203,15 @@ def group_inlet(hall: ti.template(), air: ti.template(), group):
 
 @ti.func
 @no_type_check
-def knee_terms(hall: ti.template(), first, end, on_curve_c, load):
-    """Return the sum of the terms of the knees ``first`` to ``end`` of a curve, without ``end``."""
-    terms = hall.zeros
-    at = first
-    while at < end:
-        knee = hall.knees[at]
-        slope = load * knee.shift_per_k + knee.slope_per_k
-        terms += larger(on_curve_c, hall.zeros + knee.inlet_c) * slope
-        at += hall.one
-    return terms
+def add_knees(
+    hall: ti.template(), servers: ti.template(), knees: ti.template(), on_curve_c, load, line
+):
+    """Return the value of a curve: a line plus the terms of the knees with indices ``knees``."""
+    ratio = line
+    for k in ti.static(range(*knees)):
+        slope = load * servers.knee_shift[k] + servers.knee_slope[k]
+        ratio = ratio + larger(on_curve_c, hall.zeros + servers.knee_c[k]) * slope
+    return ratio
 
 
 @ti.func
@@ -254,11 +239,12 @@ def compute_group(
             at = ti.min(racks.first_group[i] + z, racks.last_group[i])
             deviation[i] = hall.group_load[at]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
-    cpu_ratio = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
-    airflow = on_curve_c * servers.fan_slope + (deviation * servers.fan_shift + racks.fan_base)
-    load, cpu_knee = deviation + racks.utilisation, servers.first_cpu_knee
-    airflow += knee_terms(hall, servers.first_fan_knee, cpu_knee, on_curve_c, load)
-    cpu_ratio += knee_terms(hall, cpu_knee, servers.end_knee, on_curve_c, load)
+    load = deviation + racks.utilisation
+    fan_knees, n_knees = ti.static(hall.fan_knees, hall.fan_knees + hall.cpu_knees)
+    fan_line = on_curve_c * servers.fan_slope + (deviation * servers.fan_shift + racks.fan_base)
+    airflow = add_knees(hall, servers, (0, fan_knees), on_curve_c, load, fan_line)
+    cpu_line = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
+    cpu_ratio = add_knees(hall, servers, (fan_knees, n_knees), on_curve_c, load, cpu_line)
     cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
     airflow = smaller(larger(airflow, racks.fan_low), servers.fan_high)
     fan_power = airflow

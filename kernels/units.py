@@ -54,15 +54,14 @@ def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
             share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
             need_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].fresh_m3s
             b += hall.one
-        strength = hall.units[dc.first_unit + unit].strength
-        hall.unit_need_m3s[chunk.first_need + unit] = strength * sum_lanes(need_m3s)
+        hall.unit_need_m3s[chunk.first_need + unit] = sum_lanes(need_m3s)
         if dc.exceeds > 0.0:
             plain_m3s, b = hall.zeros, 0
             while b < n_blocks:
                 share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
                 plain_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].plain_m3s
                 b += hall.one
-            hall.unit_plain_m3s[chunk.first_need + unit] = strength * sum_lanes(plain_m3s)
+            hall.unit_plain_m3s[chunk.first_need + unit] = sum_lanes(plain_m3s)
         unit += hall.one
 
 
@@ -308,6 +307,8 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
         change = ti.max(change, ti.abs(strength / unit.strength - 1.0))
         if strength != 1.0:
             weighs = ti.cast(1.0, ti.f64)
+        if strength != unit.strength:
+            dc.shares_due = 1.0
         unit.strength = strength
         at += hall.one
     dc.weighs = weighs
@@ -354,6 +355,49 @@ def draw_own_return(hall: ti.template(), n, return_c, is_first):
         unit = hall.units[at]
         unit.return_offset_k = unit.return_offset_k - mean_k
         at += hall.one
+
+
+@ti.func
+@no_type_check
+def set_present_shares(hall: ti.template(), n, first_chunk, end_chunk):
+    """Set unit shares and exhaust shares of racks to the present weights and airflow of the units.
+
+    The strengths u_k of the units change the shares to s_jk u_k / sum_l s_jl u_l. Units that
+    deliver more than their racks need lower r_j to r_j exp(-kappa max(0, eta_j - 1)), with
+    eta_j = sum_k s_jk eta_k of the present shares.
+    """
+    dc, unit_0 = hall.dcs[n], hall.dcs[n].first_unit
+    n_units = hall.dcs[n + 1].first_unit - unit_0
+    for block_at in range(hall.chunks[first_chunk].first_block, hall.chunks[end_chunk].first_block):
+        share_0, unit = first_share_at(hall, n, block_at), 0
+        if dc.shares_due > 0.0:
+            per_total = ti.Vector([ti.cast(1.0, ti.f64)] * LANES)
+            if dc.weighs > 0.0:
+                total = ti.Vector([ti.cast(1e-30, ti.f64)] * LANES)  # Padding has no shares.
+                while unit < n_units:
+                    total += hall.plenum_shares[share_0 + unit] * hall.units[unit_0 + unit].strength
+                    unit += hall.one
+                per_total = per_total / total
+            unit = 0
+            while unit < n_units:
+                strength = hall.units[unit_0 + unit].strength
+                share = hall.plenum_shares[share_0 + unit] * (per_total * strength)
+                present = hall.zeros
+                for i in range(LANES):
+                    present[i] = ti.cast(share[i], hall.real)
+                hall.unit_shares[share_0 + unit] = present
+                unit += hall.one
+        if dc.exceeds > 0.0:
+            supply_ratio = hall.zeros
+            unit = 0
+            while unit < n_units:
+                ratio = ti.cast(hall.units[unit_0 + unit].supply_ratio, hall.real)
+                supply_ratio += hall.unit_shares[share_0 + unit] * ratio
+                unit += hall.one
+            excess = larger(supply_ratio - hall.real(1.0), hall.zeros)
+            factor = hall.exp_of(excess * ti.cast(-dc.oversupply, hall.real))
+            block = hall.blocks[block_at]
+            block.present_exhaust_share = block.exhaust_share * factor
 
 
 @ti.func
@@ -490,8 +534,7 @@ def run_crac_units(hall: ti.template(), n, is_last):
         unit.speed = speed
         unit.mean_supply_c = mean_supply_c
         at += hall.one
-    dc.exceeds_used, dc.weighs_used = dc.exceeds, dc.weighs
-    dc.exceeds = exceeds
+    dc.exceeds_used, dc.exceeds, dc.shares_due = dc.exceeds, exceeds, none
     if dc.coupling > 0.0 and not is_last:
         change = weigh_units(hall, n, False)
         units.most_f_change = ti.max(units.most_f_change, change)

@@ -19,6 +19,7 @@ from sdc_taichi.kernels.hall_arguments import (
     COVERED_WITHIN,
     DC_COEFFICIENTS,
     DC_CONTROL,
+    DC_DOUBLES,
     DC_OUT,
     DONE,
     GROUP_INPUTS,
@@ -52,6 +53,27 @@ from sdc_taichi.sim.sampled_halls import (
     supply_range_c,
 )
 from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
+
+_FIRST_CONTROL = [
+    np.array(
+        in_row_order(
+            DC_CONTROL,
+            {
+                "status": RUNNING,
+                "exchanges_before": exchanges_before,
+                # There are two exhaust buffers: a sweep reads what the sweep before it wrote.
+                "exhaust_side": exchanges_before,
+                "sweep": 0,
+                "chunks_done": 0,
+            },
+        ),
+        np.int32,
+    )[:, None]
+    for exchanges_before in (0, 1)
+]
+"""Rows ``DC_CONTROL`` at the start of a step, (rows, 1), by the value of ``exchanges_before``."""
+_SHIFTS = slice(row_index(DC_DOUBLES, "shift_k"), row_index(DC_DOUBLES, "last_shift_k") + 1)
+"""Rows of ``DC_DOUBLES`` that are 0 at the start of a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +271,9 @@ class Hall:
         self._shapes = _condition_shapes(fleet)
         self._recirculates = fleet.air is not None
         self._no_flow_m3s = np.zeros(fleet.size)
+        self._no_stored_heat = dict.fromkeys(
+            ("room_j", "water_j", "tank_j", "water_warmed_k", "most_warmed_k"), np.zeros(fleet.size)
+        )
         tables = build_hall_tables(fleet, self._dtype, SLICES_PER_THREAD * threads)
         self._tables, self._places = tables, tables.places
         self._rack, self._unit = tables.rows("rack_inputs"), tables.rows("unit_inputs")
@@ -269,6 +294,8 @@ class Hall:
         constant = tables.arrays | {
             "recirculates": self._recirculates,
             "own_return": bool(fleet.own_return.any()),
+            "fan_knees": tables.fan_knees,
+            "cpu_knees": tables.cpu_knees,
             "slices": tables.slices,
             "one": 1,
             "outlet_model": OUTLETS.index(fleet.models["outlet"]),
@@ -710,18 +737,9 @@ class Hall:
                 looks up an initial guess.
             chosen: True for the data centers that run the step, (B,).
         """
-        first = {
-            "status": RUNNING,
-            "exchanges_before": exchanges_before,
-            # There are two exhaust buffers: a sweep reads the one that the sweep before it wrote.
-            "exhaust_side": exchanges_before,
-            "sweep": 0,
-            "chunks_done": 0,
-        }
-        for row, value in zip(self._control.values(), in_row_order(DC_CONTROL, first), strict=True):
-            np.copyto(row, value, where=chosen)
-        for name in ("shift_k", "last_change_k", "last_shift_k"):
-            np.copyto(self._dc[name], 0.0, where=chosen)
+        arrays = self._tables.arrays
+        np.copyto(arrays["dc_control"], _FIRST_CONTROL[exchanges_before], where=chosen)
+        np.copyto(arrays["dc_doubles"][_SHIFTS], 0.0, where=chosen)
 
     def _add_sampled_racks(self, precision: Precision) -> None:
         """Compute the modes of all sparse halls, and the racks that they sample.
@@ -991,18 +1009,25 @@ class Hall:
             )
         else:
             unit_supply_c, cubed_flow_m3s = results["supply_c"], self._no_flow_m3s
-        water_warmed_k = self._dc["water_j"] / np.maximum(self._dc["water_j_per_k"], 1e-30)
         return HallSums(
             unit_supply_c=unit_supply_c.copy(),
             unit_airflow_m3s=unit["flow_m3s"].copy(),
             cubed_flow_m3s=cubed_flow_m3s,
-            room_j=self._dc["room_j"] + (self._dc["water_j"] + self._dc["tank_j"]),
-            water_j=self._dc["water_j"].copy(),
-            tank_j=self._dc["tank_j"].copy(),
-            water_warmed_k=water_warmed_k,
-            most_warmed_k=water_warmed_k,
+            **(self._stored_heat() if transient else self._no_stored_heat),
             **results,
         )
+
+    def _stored_heat(self) -> dict[str, F64]:
+        """Return the heat stored in room, chilled water and tank at the end of a transient step."""
+        dc = self._dc
+        water_warmed_k = dc["water_j"] / np.maximum(dc["water_j_per_k"], 1e-30)
+        return {
+            "room_j": dc["room_j"] + (dc["water_j"] + dc["tank_j"]),
+            "water_j": dc["water_j"].copy(),
+            "tank_j": dc["tank_j"].copy(),
+            "water_warmed_k": water_warmed_k,
+            "most_warmed_k": water_warmed_k,
+        }
 
 
 def _water_rows(water: ChilledWater | None) -> dict[str, F64 | float]:

@@ -110,6 +110,10 @@ class HallTables:
     """Length of arrays with one entry per block and group, such as ``server_c``."""
     slices: int
     """Number of slices into which the tasks are divided for the threads."""
+    fan_knees: int
+    """Number of knees of the airflow ratio of the servers of each data center."""
+    cpu_knees: int
+    """Number of knees of the power ratio of the servers of each data center."""
     units_per_dc: I32
     """Number of CRAC units of each data center, (B,)."""
     plenum: SharedPlenum
@@ -149,7 +153,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     most_groups, group_places = block_ints[1].max(), block_ints[1].sum()
     unit_shares, mix_weights, first_mix_weight = _build_air(fleet, places, dtype)
     steady_states, guess_rows = build_steady_states(fleet, places, dtype, {})
-    server_knees, first_knees = _build_knees(fleet, dtype)
+    server_knees, fan_knees, cpu_knees = _build_knees(fleet, dtype)
     dc_ints = {
         "first_chunk": first_chunk,
         "first_unit": fleet.unit_offsets,
@@ -157,7 +161,6 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "racks": np.diff(fleet.rack_offsets),
         "first_mix_weight": first_mix_weight,
         "first_sample": [],
-        **first_knees,
     }
     rack_state = vectors(dtype, len(RACK_STATE), places.count // LANES)
     mode_amounts = vectors(dtype, slices * MODE_VECTORS)
@@ -169,8 +172,8 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "place_ints": place_ints,
         **_build_runs(fleet, places, dtype),
         "dc_coefficients": np.array(fleet.dcs.T, dtype, order="C").reshape(-1),
-        "server_knees": server_knees,
         "rack_inputs": _build_rack_inputs(fleet, places, dtype),
+        "server_knees": server_knees,
         "group_inputs": group_inputs,
         "unit_inputs": np.ones((len(UNIT_INPUTS), fleet.units), dtype),
         "unit_shares": unit_shares,
@@ -196,7 +199,9 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     doubles = arrays["dc_doubles"]
     adjusts_supply = doubles[row_index(DC_DOUBLES, "adjusts_supply")]
     plenum = SharedPlenum(fleet, unit_shares, dc_ints["first_share"], LANES, adjusts_supply)
-    tables = HallTables(places, arrays, int(group_places), slices, units, plenum)
+    tables = HallTables(
+        places, arrays, int(group_places), slices, fan_knees, cpu_knees, units, plenum
+    )
     tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
     tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
     tables.rows("unit_inputs")["casing_m3"][:] = CASING_S * fleet.unit_design_m3s
@@ -343,19 +348,23 @@ def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -
     return entry
 
 
-def _build_knees(fleet: Fleet, dtype: npt.DTypeLike) -> tuple[Array, dict[str, Array]]:
-    """Return the rows ``KNEES`` of the curves of all servers, and their index rows of ``DC_INTS``.
+def _build_knees(fleet: Fleet, dtype: npt.DTypeLike) -> tuple[Array, int, int]:
+    """Return the rows ``KNEES`` of all servers, and the numbers of knees of airflow and power.
 
-    Data centers without knees share an array that is not empty, because kernels need an address.
+    A data center has the knees of its airflow ratio, then those of its power ratio. Curves with
+    fewer knees than others have further knees that change no slope. The array is not empty, because
+    kernels need an address.
     """
-    knees_of = {id(c.servers): c.servers.curves for c in fleet.configs}
-    curves = [knees_of[id(c.servers)] for c in fleet.configs]
-    knees = [knee for c in curves for knee in (*c.fan_knees, *c.cpu_knees)]
-    first = offsets_from_counts([len(c.fan_knees) + len(c.cpu_knees) for c in curves], "knees")
-    rows = np.zeros((len(KNEES), max(1, len(knees))), dtype)
-    rows[:, : len(knees)] = np.array(knees).reshape(-1, len(KNEES)).T
-    cpu = first[:-1] + np.array([len(c.fan_knees) for c in curves], np.int32)
-    return rows, {"first_fan_knee": first, "first_cpu_knee": cpu}
+    curves = {id(c.servers): c.servers.curves for c in fleet.configs}
+    fan = max(len(curve.fan_knees) for curve in curves.values())
+    cpu = max(len(curve.cpu_knees) for curve in curves.values())
+    rows_of = {}
+    for servers, curve in curves.items():
+        rows_of[servers] = rows = np.zeros((len(KNEES), fan + cpu), dtype)
+        for first, knees in ((0, curve.fan_knees), (fan, curve.cpu_knees)):
+            rows[:, first : first + len(knees)] = np.array(knees).reshape(-1, len(KNEES)).T
+    rows = np.concatenate([rows_of[id(c.servers)] for c in fleet.configs], axis=1)
+    return rows if rows.size else np.zeros((len(KNEES), 1), dtype), fan, cpu
 
 
 def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Array, Array]:
@@ -609,6 +618,7 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
         "strength": ones if air is None else air.mix_weights.strength,
         "per_strength": ones if air is None else 1.0 / air.mix_weights.strength,
         "exhaust_share": 0.0 * ones if air is None else air.exhaust_share,
+        "present_exhaust_share": 0.0 * ones,
         "per_server": 1.0 / fleet.per_rack_servers(),
     }
     out = vectors(dtype, len(RACK_INPUTS), places.count // LANES)
