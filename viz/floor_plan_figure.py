@@ -13,6 +13,7 @@ from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
 from sdc_taichi.run.failover import MINUTES, SHOWN_AFTER_MIN, Failover
+from sdc_taichi.run.rack_places import RackPlaces
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
 
@@ -111,6 +112,49 @@ def floor_plan_figure(
         pad=22,
     )
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8.5, frameon=False,
+                borderaxespad=0.2, handlelength=1.6)  # fmt: skip
+    return figure
+
+
+def places_figure(study: RackPlaces) -> Figure:
+    """Draw the floor plan of a hall with new racks at the best candidate, marked by crosses.
+
+    Args:
+        study: result of ``study_places``.
+
+    Raises:
+        SdcError: matplotlib is missing, or the hall has no solution at its design point.
+    """
+    from matplotlib.collections import PolyCollection
+
+    best, solved = study.candidates[0], solve_design_hall(study.best)
+    shown = RackValues(
+        values=best.rack_inlet_c,
+        label="hottest inlet of the rack at full load (°C)",
+        marked=best.hottest_rack,
+        mark_label=f"hottest rack, {best.hottest_c:.1f} °C",
+    )
+    figure = floor_plan_figure(solved, shown)
+    axes = figure.axes[0]
+    page = _page(study.config.hall, len(solved.unit_m3s), LONG_SIDE_IN)
+    axes.add_collection(
+        PolyCollection(
+            list(_rack_boxes(page)[list(best.racks)]),
+            facecolor="none",
+            edgecolor=GREEN,
+            linewidth=2.5,
+            label=f"new racks of {literal_text(study.type)}",
+        )
+    )
+    fits = "fits" if not best.exceeded else f"exceeds: {'; '.join(best.exceeded)}"
+    axes.set_title(
+        f"{literal_text(study.config.name)} with {study.count} {literal_text(study.type)} at "
+        f"{literal_text(best.places)}: {best.it_kw:,.0f} kW IT, {fits}",
+        fontsize=10,
+        loc="left",
+        pad=22,
+    )
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize=8.5, frameon=False,
                 borderaxespad=0.2, handlelength=1.6)  # fmt: skip
     return figure
 
@@ -319,6 +363,15 @@ def _draw_aisles(axes: Axes, page: _Page) -> None:
                 )  # fmt: skip
 
 
+def _rack_boxes(page: _Page) -> F64:
+    """Return the corners of each rack on the page, (R, 4, 2)."""
+    layout = page.hall.layout
+    depth_m = page.row_gap_m if page.is_coarse else layout.rack_depth_m
+    half_m = np.array([layout.rack_pitch_m, depth_m]) / 2
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return page.place(page.plan.centre_m[:, None] + corners * half_m)
+
+
 def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
     """Draw racks in the colours of their values, with the values as numbers if they fit."""
     from matplotlib.collections import PolyCollection
@@ -327,9 +380,7 @@ def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
 
     layout, plan = page.hall.layout, page.plan
     size_m = layout.rack_pitch_m, layout.rack_depth_m
-    half_m = np.array([size_m[0], page.row_gap_m if page.is_coarse else size_m[1]]) / 2
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    boxes = page.place(plan.centre_m[:, None] + corners * half_m)
+    boxes = _rack_boxes(page)
     has_edges = page.fits(*size_m, (8.0, 8.0))
     low, high = colour_range(shown.values)
     racks = PolyCollection(

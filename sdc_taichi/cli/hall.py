@@ -1,4 +1,4 @@
-"""``sdc-taichi hall``: describe a hall, solve its airflow, and simulate failures of its cooling."""
+"""``sdc-taichi hall``: describe a hall, solve its air, place racks, and let its cooling fail."""
 
 from __future__ import annotations
 
@@ -26,7 +26,13 @@ from sdc_taichi.cli.options import (
     json_option,
     out_option,
 )
-from sdc_taichi.cli.terminal import ProgressLines, count_text, duration, stage_bars
+from sdc_taichi.cli.terminal import (
+    ProgressLines,
+    count_text,
+    duration,
+    stage_bars,
+    wide_console,
+)
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
 from sdc_taichi.hall.air_metrics import rank
@@ -36,12 +42,13 @@ from sdc_taichi.types import F64
 if TYPE_CHECKING:
     from sdc_taichi.layout_solver.solve import LayoutSolution, SolverProgress
     from sdc_taichi.run.failover import Failover
+    from sdc_taichi.run.rack_places import RackPlaces
     from sdc_taichi.sim.design_hall import DesignHall
 
 LEAST_TOLD_S = 5.0
 """Shortest expected time of a solution, in s, that ``hall solve`` announces."""
 
-hall_app = CommandApp(help="Describe a hall, solve its air.", no_args_is_help=True)
+hall_app = CommandApp(help="Describe a hall, solve its air, place racks.", no_args_is_help=True)
 hall_app.command("why", may_allow_code=True)(why_command)
 
 
@@ -277,6 +284,110 @@ def _print_study(study: Failover) -> None:
         f"within {MINUTES} min; tank is the time until warm water fills the buffer tank; racks off "
         f"are those after {MINUTES} min."
     )
+
+
+MOST_PLACES = 15
+"""Largest number of candidates in the table that ``hall place`` prints."""
+
+
+@hall_app.command("place")
+def place_command(
+    *,
+    config: ConfigOptions,
+    rack_type: Annotated[
+        str, typer.Option("--type", metavar="TYPE", help="Type of the new racks, of rack_types.")
+    ],
+    count: Annotated[int, typer.Option(min=1, help="Number of new racks.")],
+    replace: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TYPE",
+            help="Type of racks to replace; repeatable. [default: racks of at most 0.2 kW]",
+        ),
+    ] = None,
+    keep: Annotated[
+        Literal["n", "n+1"],
+        typer.Option("--keep", help="n+1: within limits also with any one CRAC unit down."),
+    ] = "n",
+    limit: Annotated[
+        float | None,
+        typer.Option(
+            "--limit-c",
+            metavar="C",
+            min=10.0,
+            max=60.0,
+            help="Highest inlet. [default: allowable of the class]",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, out_option("Draw the best candidate on the floor plan.", "FILE.png")
+    ] = None,
+    force: Annotated[bool, force_option()] = False,
+    as_json: Annotated[bool, json_option("Print all candidates as JSON.")] = False,
+) -> None:
+    """Find where racks of a type fit: positions ranked by the hottest inlet at full load.
+
+    CRAC units, plant and floor stay those of the hall as it is.
+    """
+    from sdc_taichi.run.rack_places import place_values, study_places
+
+    check_out_file(out, ".png", force=force)
+    study = study_places(
+        config.read()[0],
+        rack_type,
+        count,
+        replaced=replace or (),
+        keep=keep,
+        inlet_limit_c=limit,
+    )
+    if out is not None:
+        from sdc_taichi.viz.floor_plan_figure import places_figure
+        from sdc_taichi.viz.plotting import save_picture
+
+        save_picture(places_figure(study), out, parents=True)
+    if as_json:
+        typer.echo(json.dumps(place_values(study), indent=2))
+        return
+    _print_places(study)
+    if out is not None:
+        typer.echo(f"Floor plan: {printable(out)}")
+
+
+def _print_places(study: RackPlaces) -> None:
+    """Print the hall as it is, and a table of the best candidates."""
+    typer.echo(
+        f"{printable(study.config.name)} at full load: {study.base_it_kw:,.0f} kW IT, hottest "
+        f"inlet {study.base_hottest_c:.1f} C, limit {study.inlet_limit_c:g} C"
+    )
+    fitting = sum(not each.exceeded for each in study.candidates)
+    typer.echo(
+        f"{study.count} x {printable(study.type)} instead of "
+        f"{printable(', '.join(study.replaced))}: {fitting} of "
+        f"{count_text(len(study.candidates), 'candidate')} fit"
+    )
+    has_lost = study.candidates[0].lost_unit_c is not None
+    table = Table()
+    table.add_column("places")
+    names = ["hottest, C", "new racks, C", "IT, kW", "CRAC air, %"]
+    for name in [*names, *["unit down, C"] * has_lost]:
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("exceeds")
+    for each in study.candidates[:MOST_PLACES]:
+        lost = [] if each.lost_unit_c is None else [f"{each.lost_unit_c:.1f}"]
+        table.add_row(
+            each.places,
+            f"{each.hottest_c:.1f}",
+            f"{each.hottest_new_c:.1f}",
+            f"{each.it_kw:,.0f}",
+            f"{100 * each.airflow_share:.0f}",
+            *lost,
+            ", ".join(each.exceeded) or "-",
+        )
+    wide_console(160).print(table)
+    if len(study.candidates) > MOST_PLACES:
+        typer.echo(f"The best {MOST_PLACES} of {len(study.candidates)} candidates.")
+    if study.note:
+        typer.echo(study.note)
 
 
 LISTED_ROWS = 12
