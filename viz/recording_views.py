@@ -69,8 +69,8 @@ class FocusTab(NamedTuple):
     """Height and width of the heat maps, in pixels."""
     has_airflow: bool
     """True if the recording has the airflow of the hall."""
-    zones: int
-    """Number of zones of the hall; 0 if the recording has none."""
+    zones: tuple[tuple[int, int], ...]
+    """Number of rows and of places of each zone; empty if the recording has no zones."""
 
 
 def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Blueprint:
@@ -210,8 +210,9 @@ def _zones_view(tab: FocusTab) -> Any:
             origin=f"{tab.path}/zone_racks/{zone}",
             contents=["$origin", f"+ {tab.path}/map/racks"],
             name=f"zone {zone}",
+            visual_bounds=rrb.VisualBounds2D(x_range=(-1, places + 1), y_range=(-1, rows + 1)),
         )
-        for zone in range(tab.zones)
+        for zone, (rows, places) in enumerate(tab.zones)
     ]
     racks = rrb.Tabs(whole, *single, active_tab=0)
     return rrb.Vertical(zones, racks, row_shares=[1, 1], name="zones")

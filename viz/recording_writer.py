@@ -328,12 +328,12 @@ class RecordingWriter:
             plan = floor_plan(hall)
             size_m = plan.length_m, plan.width_m, hall.layout.ceiling_m
             name, path = self._names[dc], self._path(dc)
-            zones = [p.zones.count for p in self._pictures[index] if isinstance(p, ZonePictures)]
+            zones = [p.shapes for p in self._pictures[index] if isinstance(p, ZonePictures)]
             has_airflow = any(isinstance(p, AirflowPictures) for p in self._pictures[index])
             scales_of_dc = self._scales[index]
             tabs.append(
                 FocusTab(
-                    name, path, size_m, scales_of_dc, grid.image_shape, has_airflow, sum(zones)
+                    name, path, size_m, scales_of_dc, grid.image_shape, has_airflow, sum(zones, ())
                 )
             )
         rewards = self._builder.reward_names or ()

@@ -38,7 +38,7 @@ TOLERANCE_K = 0.25
 """Change of a rack's inlet at which the racks of its zone are recorded again, in K."""
 MOST_RACKS_PER_STEP = 6_400
 """Largest number of racks that a step records again, which bounds its size."""
-_LABEL_RGB = (135, 135, 135)
+_LABEL_RGB = (255, 255, 255)
 _TILE_PIXELS = 6
 """Height of the tile of a zone, in pixels, and smallest width."""
 
@@ -105,6 +105,14 @@ class ZonePictures:
         self._zone_racks: list[Frames[F32]] = [Frames() for _ in self._of_zone]
 
     @property
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        """Number of rows and of places of each zone."""
+        bounds = (self.zones.bounds(zone) for zone in range(self.zones.count))
+        return tuple(
+            (rows.stop - rows.start, places.stop - places.start) for rows, places in bounds
+        )
+
+    @property
     def size_bytes(self) -> int:
         """Size of the frames that ``take`` returns, in bytes."""
         racks = sum(
@@ -165,11 +173,10 @@ class ZonePictures:
         yield "zone_racks", classes
         grid = tile_grid(self._hall)
         pixel = grid.tile_width + grid.gap, grid.tile_height + grid.gap
-        for zone in range(self.zones.count):
+        for zone, shape in enumerate(self.shapes):
             rows, places = self.zones.bounds(zone)
             at = places.start * pixel[0], rows.start * pixel[1]
-            image = class_format((rows.stop - rows.start, places.stop - places.start))
-            yield f"zone_racks/{zone}", placed(image, scale=pixel, at=at)
+            yield f"zone_racks/{zone}", placed(class_format(shape), scale=pixel, at=at)
 
     def take(self, scales: Mapping[str, ColourScale]) -> Iterator[Columns]:
         """Yield the columns of all frames that have not been written, and forget the frames.
