@@ -20,6 +20,7 @@ from sdc_taichi.cli.config import config_app, new_command
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.doctor import doctor_command
 from sdc_taichi.cli.evaluate import evaluate_command
+from sdc_taichi.cli.export import export_command
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.jobs import JobsCommand
 from sdc_taichi.cli.optimum import optimum_command
@@ -83,6 +84,7 @@ app.add_typer(data_app, name="data")
 app.add_typer(hall_app, name="hall")
 app.add_typer(policy_app, name="policy")
 app.command("report")(report_command)
+app.command("export")(export_command)
 app.command("compare")(compare_command)
 app.command("view")(view_command)
 app.command("doctor")(doctor_command)

@@ -32,6 +32,7 @@ class Extra(NamedTuple):
 
 EXTRAS = {
     "plot": Extra(("matplotlib",), "pictures and reports"),
+    "excel": Extra(("xlsxwriter",), "export to Excel"),
     "fetch": Extra(("requests", "urllib3"), "data fetch"),
     "train": Extra(("torch", "tensorboard"), "training; trained policies run without it"),
     "onnx": Extra(("onnx", "onnxruntime"), "export of policies as ONNX"),

@@ -46,6 +46,10 @@ REPORT_FILE = "report.html"
 """Name of the report that ``sdc-taichi report`` writes from the other files of a run folder."""
 OPTIMUM_FILE = "optimum.json"
 """Name of the file that ``optimum_folder.write_optimum`` adds to the run of a known optimum."""
+EXPORT_FILES = tuple(
+    f"{table}{end}" for table in ("steps", "racks") for end in (".csv", ".xlsx", ".bms.csv")
+)
+"""Names of the files that ``sdc-taichi export`` writes from the tables of a run folder."""
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -147,7 +151,7 @@ def simulate_to_folder(
         write_text(out / config_name, configs)
         if has_former_run:
             former = () if racks is not None else (RACK_HISTORY_FILE,)
-            for name in (other_name, REPORT_FILE, OPTIMUM_FILE, *former):
+            for name in (other_name, REPORT_FILE, OPTIMUM_FILE, *EXPORT_FILES, *former):
                 with naming_errors(out / name):
                     (out / name).unlink(missing_ok=True)
         content = _metrics_content(description, totals, sim.fleet, events)
@@ -245,7 +249,7 @@ def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[st
 
 def _is_left_by_broken_run(path: Path) -> bool:
     """Return True for a file that a run can leave behind if it ends before writing metrics.json."""
-    names = (STEPS_FILE, RACK_HISTORY_FILE, REPORT_FILE, OPTIMUM_FILE)
+    names = (STEPS_FILE, RACK_HISTORY_FILE, REPORT_FILE, OPTIMUM_FILE, *EXPORT_FILES)
     return path.name in names or path.suffix in (".part", ".rrd")
 
 
