@@ -112,7 +112,7 @@ def test_libraries_read_a_history_alike(folder: Path) -> None:
     by_arrow = table.group_by("rack").aggregate([("inlet_max_c", "max")]).to_pandas()
     assert dict(by_arrow.itertuples(index=False)) == by_pandas.to_dict()
     query = f"SELECT rack, max(inlet_max_c) FROM '{path}' GROUP BY rack"
-    assert dict(duckdb.sql(query).fetchall()) == by_pandas.to_dict()
+    assert dict(duckdb.execute(query).fetchall()) == by_pandas.to_dict()
 
 
 def test_exports_of_a_former_run_are_removed(folder: Path, tmp_path: Path) -> None:

@@ -227,7 +227,7 @@ def _local_times(block: Any) -> npt.NDArray[np.datetime64]:
     """Return the local standard time of each row, in s."""
     utc = np.asarray(block["time"].cast("int64").to_numpy()).astype("datetime64[ms]")
     minutes = np.round(60 * block["utc_offset_h"].to_numpy()).astype("timedelta64[m]")
-    return (utc + minutes).astype("datetime64[s]")
+    return np.asarray((utc + minutes).astype("datetime64[s]"))
 
 
 def _distinct_texts(
