@@ -353,18 +353,22 @@ def test_maps_name_their_racks(run: Run, dc: int) -> None:
 @pytest.mark.parametrize("dc", FOCUS)
 def test_maps_mark_the_hottest_rack(run: Run, dc: int) -> None:
     racks = slice(*run.sim.fleet.rack_offsets[dc : dc + 2])
-    entity = run.recorded[f"/dc/{FOCUS[dc]}/map/hottest"]
-    assert entity["step"] == list(range(0, STEPS, 2))
-    for step, (label,) in zip(entity["step"], entity["LineStrips2D:labels"], strict=True):
+    entity = run.recorded[f"/dc/{FOCUS[dc]}/map/hottest_text"]
+    outlines = run.recorded[f"/dc/{FOCUS[dc]}/map/hottest"]
+    assert set(range(0, STEPS, 2)) <= set(entity["step"]) == set(outlines["step"])
+    for step, (label,) in zip(entity["step"], entity["Points2D:labels"], strict=True):
         inlet_c = run.results[step].rack_inlet_max_c[racks]
         rack = int(np.argmax(rank(inlet_c)))
-        assert label == f"row {rack // 2}, rack {rack}: {inlet_c[rack]:.1f} C"
+        assert label == f"hottest: row {rack // 2}, rack {rack}, {inlet_c[rack]:.1f} C"
 
 
 def test_maps_mark_units_that_are_down(run: Run) -> None:
     entity = run.recorded[f"/dc/{FOCUS[0]}/map/down"]
     marks = dict(zip(entity["step"], entity["Points2D:labels"], strict=True))
     assert marks == {12: ["CRAC 0 down"], 20: [], 24: ["CRAC 0 down", "CRAC 1 down"], 32: []}
+    texts_of_units = run.recorded[f"/dc/{FOCUS[0]}/map/down_text"]
+    shown = dict(zip(texts_of_units["step"], texts_of_units["Points2D:labels"], strict=True))
+    assert shown == {12: ["CRAC 0 down"], 20: [], 24: ["CRAC 0, 1 down"], 32: []}
     assert f"/dc/{FOCUS[1]}/map/down" not in run.recorded or (
         "step" not in run.recorded[f"/dc/{FOCUS[1]}/map/down"]
     )
@@ -403,9 +407,9 @@ def test_hottest_row_is_drawn_by_time(run: Run) -> None:
     expected = np.clip(inlet_c[:, racks], values[1], values[-1])
     resolution = np.median(np.diff(values[1:]))
     np.testing.assert_allclose(shown, expected, atol=resolution / 2 + 0.005)
-    ((mark,),) = run.recorded[f"/dc/{FOCUS[0]}/row/hottest"]["Points2D:labels"]
+    ((_, mark),) = run.recorded[f"/dc/{FOCUS[0]}/row/hottest"]["Points2D:labels"]
     clock = str(run.column("time", 0)[step])
-    assert mark.startswith(f"row {rack // 2}, rack {rack}: {inlet_c.max():.1f} C, ")
+    assert mark.startswith(f"hottest: row {rack // 2}, rack {rack}, {inlet_c.max():.1f} C, ")
     assert mark.endswith(f"{clock[5:10]} {clock[11:16]}")
 
 

@@ -6,6 +6,7 @@ its label. Class 0 has no value and no colour; the others are values in equal st
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -149,6 +150,7 @@ def colours_of(scale: ColourScale) -> npt.NDArray[np.uint32]:
     return np.concatenate([np.zeros(1, np.uint32), opaque])
 
 
+@functools.lru_cache(maxsize=32)
 def annotation_context(scale: ColourScale) -> rr.AnnotationContext:
     """Return Rerun's description of the colours and names of the classes of a scale."""
     import rerun as rr

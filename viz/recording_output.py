@@ -194,10 +194,19 @@ class RecordingOutput:
 
         self._chunks.append(Chunk.from_columns(entity, times, columns))
 
-    def send_static(self, entity: str, component: Any) -> None:
-        """Send a component of an entity that is the same at all times."""
+    def send_static(self, components: Iterable[tuple[str, Any]]) -> None:
+        """Send components of entities that are the same at all times.
+
+        Args:
+            components: paths of entities, each with a component or an archetype.
+        """
+        # Each call makes a chunk, of a kilobyte or more, so that those of an entity share a call.
+        by_entity: dict[str, list[Any]] = {}
+        for entity, component in components:
+            by_entity.setdefault(entity, []).append(component)
         if self._stream is not None:
-            self._stream.log(entity, component, static=True, strict=True)
+            for entity, parts in by_entity.items():
+                self._stream.log(entity, *parts, static=True, strict=True)
 
     def send_block(self) -> None:
         """Send the current block; threads of Rerun write it while the simulation continues."""

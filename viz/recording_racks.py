@@ -73,7 +73,7 @@ def trend_lines(racks: Sequence[int], peak_c: F64, racks_per_row: int) -> rr.Ser
 
 
 def mark_columns(inlet_c: Reals, hall: HallConfig, grid: TileGrid) -> Any:
-    """Return the outline of the rack with the hottest inlet on the maps, with its name and value.
+    """Return the outline of the rack with the hottest inlet on the maps.
 
     Args:
         inlet_c: inlet of each of R racks in M maps, in C, (M, R).
@@ -86,12 +86,23 @@ def mark_columns(inlet_c: Reals, hall: HallConfig, grid: TileGrid) -> Any:
     right, bottom = left + grid.tile_width, top + grid.tile_height
     corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
     strips = np.array(corners, dtype=np.float32).transpose(2, 0, 1)
+    return rr.LineStrips2D.columns(strips=strips)
+
+
+def mark_texts(inlet_c: Reals, hall: HallConfig) -> Any:
+    """Return the name and the inlet of the rack with the hottest inlet, for the text of maps.
+
+    Args:
+        inlet_c: inlet of each of R racks in M maps, in C, (M, R).
+        hall: the hall.
+    """
+    racks = np.argmax(rank(inlet_c), axis=1)
     hottest_c = inlet_c[np.arange(len(racks)), racks]
     labels = [
-        f"{rack_place(int(rack), hall.racks_per_row)}: {value:.1f} C"
+        f"hottest: {rack_place(int(rack), hall.racks_per_row)}, {value:.1f} C"
         for rack, value in zip(racks, hottest_c, strict=True)
     ]
-    return rr.LineStrips2D.columns(strips=strips, labels=labels)
+    return rr.Points2D.columns(labels=labels)
 
 
 def mark_entities(path: str, hall: HallConfig, units: int, grid: TileGrid) -> Entities:
@@ -103,10 +114,18 @@ def mark_entities(path: str, hall: HallConfig, units: int, grid: TileGrid) -> En
         units: number of CRAC units.
         grid: geometry of the tiles of the maps.
     """
-    hottest = rr.LineStrips2D.from_fields(
-        colors=MARK_RGB, radii=rr.Radius.ui_points(1.5), show_labels=True
-    )
-    yield f"{path}/hottest", hottest
+    outline = rr.LineStrips2D.from_fields(colors=MARK_RGB, radii=rr.Radius.ui_points(1.5))
+    yield f"{path}/hottest", outline
+    # Texts are above and below the map, where they hide no rack and no edge of the view cuts them.
+    height, width = grid.image_shape
+    for entity, y, colour in (("hottest_text", -0.16, MARK_RGB), ("down_text", 1.0, DOWN_RGB)):
+        text = rr.Points2D(
+            [(width / 2, y * height)],
+            radii=rr.Radius.ui_points(0.5),
+            colors=colour,
+            show_labels=True,
+        )
+        yield f"{path}/{entity}", text
     names = [f"CRAC {unit}" for unit in range(units)]
     points = rr.Points2D(
         unit_pixels(hall, units, grid),
@@ -117,7 +136,7 @@ def mark_entities(path: str, hall: HallConfig, units: int, grid: TileGrid) -> En
     )
     yield f"{path}/crac", points
     down = rr.Points2D.from_fields(
-        radii=rr.Radius.ui_points(7.0), colors=DOWN_RGB, show_labels=True
+        radii=rr.Radius.ui_points(7.0), colors=DOWN_RGB, show_labels=False
     )
     yield f"{path}/down", down
 
@@ -144,6 +163,17 @@ def down_columns(down: Sequence[Sequence[int]], places: F64) -> Any:
         positions=places[units].reshape(-1, 2), labels=[f"CRAC {unit} down" for unit in units]
     )
     return columns.partition([len(at_time) for at_time in down])
+
+
+def down_texts(down: Sequence[Sequence[int]]) -> Any:
+    """Return a text about the CRAC units that are down, at each time at which they change."""
+    texts = [
+        f"CRAC {', '.join(map(str, units[:4]))}{', ...' if len(units) > 4 else ''} down"
+        for units in down
+        if units
+    ]
+    columns = rr.Points2D.columns(labels=texts)
+    return columns.partition([1 if units else 0 for units in down])
 
 
 class HottestRow:
@@ -203,10 +233,10 @@ class HottestRow:
         name = rack_place(int(self._racks[place]), per_row)
         hottest_c = float(self._values.inlet_c[at, place])
         mark = rr.Points2D(
-            [self._pixel(int(at), int(place))],
-            radii=rr.Radius.ui_points(5.0),
+            [self._pixel(int(at), int(place)), (width / 2, -0.25 * height)],
+            radii=[-5.0, -0.5],  # negative: points of the screen
             colors=MARK_RGB,
-            labels=[f"{name}: {hottest_c:.1f} C, {clock[int(at)]}"],
+            labels=["", f"hottest: {name}, {hottest_c:.1f} C, {clock[int(at)]}"],
             show_labels=True,
         )
         yield f"{self._path}/hottest", mark
@@ -227,7 +257,9 @@ class HottestRow:
         ticks = np.unique(
             np.linspace(0, len(columns) - 1, min(5, len(columns))).round().astype(int)
         )
-        below = [((tick + 0.5) * self._across, height + 6.0) for tick in ticks.tolist()]
+        # The first and the last time may be at the same day, of which the time of day suffices.
+        part = slice(6, None) if columns[0][:5] == columns[-1][:5] else slice(0, 5)
+        below = [((tick + 0.5) * self._across, 1.1 * height) for tick in ticks.tolist()]
         last = self._hall.racks_per_row - 1
         places = sorted({0, last // 2, last})
         beside = [(-6.0, (place + 0.5) * self._down) for place in places]
@@ -237,7 +269,7 @@ class HottestRow:
             [*below, *beside],
             radii=rr.Radius.ui_points(1.5),
             colors=_LABEL_RGB,
-            labels=[*(columns[tick] for tick in ticks.tolist()), *names],
+            labels=[*(columns[tick][part] for tick in ticks.tolist()), *names],
             show_labels=True,
         )
 

@@ -326,7 +326,7 @@ def summary_markdown(
         f"of inlets jump at {_limits_text(scales, focus)}. Resolution: {resolution}. A pointer on "
         "a map names rack and value.",
         "",
-        f"The map of changes shows inlets less those of: {reference}." * ("change" in of_first),
+        f"The map of changes shows inlets less those {reference}." * ("change" in of_first),
         "",
         _INPUTS_TEXTS[description.get("synthetic")],
         "",

@@ -40,7 +40,7 @@ MAX_UNIT_LINES = 24
 
 MAP_TITLES = {
     "inlet": "rack inlet",
-    "change": "rack inlet less reference",
+    "change": "rack inlet less that",
     "rise": "rack inlet less supply air",
     "outlet": "rack outlet",
     "power": "rack power",
@@ -59,6 +59,8 @@ class FocusTab(NamedTuple):
 
     name: str
     """Name of the data center in the recording."""
+    reference: str
+    """Reference of the map of changes, which completes its title."""
     path: str
     """Path of the data center's entities."""
     size_m: tuple[float, float, float]
@@ -144,21 +146,26 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
     actions = rrb.StateTimelineView(
         origin=f"{tab.path}/actions", name="actions", time_view=_whole_run()
     )
-    trends = [_plot_view(f"{tab.path}/racks/{entity}", title) for entity, title in TRENDS.items()]
-    hottest_row = rrb.Spatial2DView(
-        origin=f"{tab.path}/row", name="hottest row: inlets by time and rack"
-    )
+
+    def trends() -> list[Any]:
+        return [_plot_view(f"{tab.path}/racks/{entity}", name) for entity, name in TRENDS.items()]
+
+    def hottest_row() -> Any:
+        return rrb.Spatial2DView(
+            origin=f"{tab.path}/row", name="hottest row: inlets by time and rack"
+        )
+
     overview = rrb.Grid(
         *plots("temperature_c"),
-        trends[0],
+        trends()[0],
         *plots("power_kw"),
-        hottest_row,
+        hottest_row(),
         *plots("carbon_intensity", QUEUE_ENTITY, "battery"),
         actions,
         grid_columns=2,
         name="overview",
     )
-    racks = rrb.Grid(*trends, hottest_row, grid_columns=2, name="racks")
+    racks = rrb.Grid(*trends(), hottest_row(), grid_columns=2, name="racks")
     cooling = rrb.Grid(
         *plots("hvac_kw", "pue"),
         _plot_view(f"{tab.path}/crac/temperature_c", "CRAC supply and return air [C]"),
@@ -204,7 +211,7 @@ def _zones_view(tab: FocusTab) -> Any:
         origin=f"{tab.path}/zones", name="zones: edge the hottest inlet, middle the mean [C]"
     )
     title = "all zones: hottest inlet of each rack [C]"
-    whole = _rack_map(tab, f"{tab.path}/zone_racks", title, ("racks", "crac", "down"))
+    whole = _rack_map(tab, f"{tab.path}/zone_racks", title, ("racks", "crac", "down", "down_text"))
     single = [
         rrb.Spatial2DView(
             origin=f"{tab.path}/zone_racks/{zone}",
@@ -238,8 +245,11 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
         name=f"colours of {MAP_TITLES[quantity]} [{scale.unit}]",
         visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
     )
-    title = f"{MAP_TITLES[quantity]} [{scale.unit}]"
-    marks = "racks", "crac", "down", "hottest"
+    name = MAP_TITLES[quantity]
+    if quantity == "change":
+        name = f"{name} {tab.reference}"
+    title = f"{name} [{scale.unit}]"
+    marks = "racks", "crac", "down", "down_text", "hottest", "hottest_text"
     image = _rack_map(tab, f"{tab.path}/map/{quantity}", title, marks)
     return rrb.Vertical(image, bar, row_shares=[5, 2], name=quantity)
 
@@ -251,7 +261,9 @@ def _state_view(tab: FocusTab) -> Any:
         name="states",
         visual_bounds=rrb.VisualBounds2D(x_range=(-30, 210), y_range=(-12, 24)),
     )
-    states = _rack_map(tab, f"{tab.path}/state", "state of the racks", ("racks", "crac", "down"))
+    states = _rack_map(
+        tab, f"{tab.path}/state", "state of the racks", ("racks", "crac", "down", "down_text")
+    )
     return rrb.Vertical(states, legend, row_shares=[5, 2], name="state")
 
 
@@ -266,13 +278,13 @@ def _rack_map(tab: FocusTab, origin: str, name: str, marks: Sequence[str]) -> An
             rack, from the map of names behind it.
     """
     height, width = tab.image_shape
-    edge = 0.06 * max(height, width)
+    edge = 0.08 * max(height, width)
     return rrb.Spatial2DView(
         origin=origin,
         contents=["$origin/**", *(f"+ {tab.path}/map/{mark}" for mark in marks)],
         name=name,
         visual_bounds=rrb.VisualBounds2D(
-            x_range=(-edge, width + edge), y_range=(-edge, height + edge)
+            x_range=(-edge, width + edge), y_range=(-0.2 * height, 1.15 * height)
         ),
     )
 

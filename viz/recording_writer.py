@@ -32,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from sdc_taichi.config import HallConfig
 from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c, rank
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, Reals, StepResult
@@ -49,7 +50,9 @@ from .recording_racks import (
     HottestRow,
     check_selection,
     down_columns,
+    down_texts,
     mark_columns,
+    mark_texts,
     trend_lines,
     unit_pixels,
 )
@@ -141,9 +144,9 @@ class RecordingWriter:
         self._drivers = sim.drivers.take(focus)
         self._cadence = choose_cadence(fleet, focus, every_steps)
         self._builder = BlockBuilder(sim, focus, self._cadence, reference)
-        self._reference_name = (
-            "the last step before an event" if reference is None else reference.name
-        )
+        self._reference_name = "before the event"
+        if reference is not None:
+            self._reference_name = f"of {reference.name}"
         self._rows_and_factors = {
             entity: ([FIELD_ROWS[f] for _, f, _ in plot.lines], line_factors(plot, sim.step_h))
             for entity, plot in PLOTS.items()
@@ -256,11 +259,10 @@ class RecordingWriter:
             times = self._times(values.steps)[index]
             lines = trend_lines(racks.tolist(), peak_c, hall.racks_per_row)
             for entity in TRENDS:
-                self._output.send_static(f"{path}/racks/{entity}", lines)
+                self._output.send_static([(f"{path}/racks/{entity}", lines)])
                 self._write_scalars(f"{path}/racks/{entity}", times, getattr(values, entity))
             row = HottestRow(f"{path}/row", history, hall, self._scales[index]["inlet"])
-            for name, component in row.entities(self._clock_texts(values.steps, index)):
-                self._output.send_static(name, component)
+            self._output.send_static(row.entities(self._clock_texts(values.steps, index)))
             if self._map_steps:
                 steps = np.array(self._map_steps)
                 cursor = row.cursor_columns(steps)
@@ -278,8 +280,7 @@ class RecordingWriter:
                 largest_k = colour_scales.largest_difference_k(counts, before)
                 scale = colour_scales.difference_scale(largest_k, before.resolution)
                 self._scales[index][quantity] = scale
-                for entity, component in scale_entities(self._path(dc), quantity, scale):
-                    self._output.send_static(entity, component)
+                self._output.send_static(scale_entities(self._path(dc), quantity, scale))
 
     def _write_moment(self) -> None:
         """Write the time that a viewer shows first, and the maps of that time."""
@@ -292,7 +293,28 @@ class RecordingWriter:
         if step not in self._map_steps:
             self._write_maps_at(step)
         moment = str(self._clock(np.array([step]))[0, 0].astype("datetime64[s]"))
-        self._output.send_static(MOMENT_ENTITY, rr.TextDocument(moment))
+        self._output.send_static([(MOMENT_ENTITY, rr.TextDocument(moment))])
+
+    def _write_marks(
+        self,
+        path: str,
+        times: list[rr.TimeColumn],
+        inlet_c: Reals,
+        hall: HallConfig,
+        grid: rasters.TileGrid,
+    ) -> None:
+        """Write the marks of the hottest rack in M maps.
+
+        Args:
+            path: path of the data center's entities.
+            times: time columns of the maps.
+            inlet_c: inlet of each rack, in C, (M, R).
+            hall: the hall.
+            grid: geometry of the tiles of the maps.
+        """
+        outline, texts = mark_columns(inlet_c, hall, grid), mark_texts(inlet_c, hall)
+        self._output.add_columns(f"{path}/map/hottest", times, outline)
+        self._output.add_columns(f"{path}/map/hottest_text", times, texts)
 
     def _write_maps_at(self, step: int) -> None:
         """Write the heat maps of the inlets of a step, from the histories of the racks."""
@@ -303,8 +325,7 @@ class RecordingWriter:
             path, times = self._path(dc), self._times(np.array([step]))[index]
             self._write_map(f"{path}/map/inlet", times, inlet_c[None], index, "inlet")
             hall = self._fleet.configs[dc].hall
-            mark = mark_columns(inlet_c[None], hall, self._tile_grids[index])
-            self._output.add_columns(f"{path}/map/hottest", times, mark)
+            self._write_marks(path, times, inlet_c[None], hall, self._tile_grids[index])
             reference_c = self._builder.reference_c(step)
             if reference_c is not None:
                 change_k = inlet_c - reference_c[self._builder.racks[index]]
@@ -318,7 +339,10 @@ class RecordingWriter:
             return
         steps = np.array([step for step, _ in changes])
         columns = down_columns([units for _, units in changes], self._unit_pixels[index])
-        self._output.add_columns(f"{path}/map/down", self._times(steps)[index], columns)
+        times = self._times(steps)[index]
+        self._output.add_columns(f"{path}/map/down", times, columns)
+        texts = down_texts([units for _, units in changes])
+        self._output.add_columns(f"{path}/map/down_text", times, texts)
 
     def _open(self) -> None:
         """Open the output and send the static entities."""
@@ -333,7 +357,14 @@ class RecordingWriter:
             scales_of_dc = self._scales[index]
             tabs.append(
                 FocusTab(
-                    name, path, size_m, scales_of_dc, grid.image_shape, has_airflow, sum(zones, ())
+                    name,
+                    self._reference_name,
+                    path,
+                    size_m,
+                    scales_of_dc,
+                    grid.image_shape,
+                    has_airflow,
+                    sum(zones, ()),
                 )
             )
         rewards = self._builder.reward_names or ()
@@ -343,18 +374,19 @@ class RecordingWriter:
         text = summary_markdown(
             self._description, self._fleet, names, scales, self._cadence, self._reference_name
         )
-        self._output.send_static("summary", rr.TextDocument(text, media_type="text/markdown"))
-        for entity, component in fleet_entities():
-            self._output.send_static(entity, component)
+        summary = rr.TextDocument(text, media_type="text/markdown")
+        self._output.send_static([("summary", summary), *fleet_entities()])
         for dc, levels in zip(self._focus, self._cadence.levels, strict=True):
-            for entity, component in data_center_entities(
-                self._fleet, dc, self._path(dc), scales[dc], levels, rewards
-            ):
-                self._output.send_static(entity, component)
+            path = self._path(dc)
+            self._output.send_static(
+                data_center_entities(self._fleet, dc, path, scales[dc], levels, rewards)
+            )
         for index, dc in enumerate(self._focus):
             for picture in self._pictures[index]:
-                for entity, component in picture.entities(self._scales[index]):
-                    self._output.send_static(f"{self._path(dc)}/{entity}", component)
+                self._output.send_static(
+                    (f"{self._path(dc)}/{entity}", component)
+                    for entity, component in picture.entities(self._scales[index])
+                )
 
     def _scales_of(self, block: Block, index: int) -> dict[str, ColourScale]:
         """Return the colour scales of the maps of a data center, from the first block.
@@ -494,8 +526,7 @@ class RecordingWriter:
             self._write_map(f"{path}/map/change", times, changes, index, "change")
         if len(block.map_steps):
             hall = self._fleet.configs[self._focus[index]].hall
-            mark = mark_columns(block.maps["inlet"][:, racks], hall, grid)
-            self._output.add_columns(f"{path}/map/hottest", map_times, mark)
+            self._write_marks(path, map_times, block.maps["inlet"][:, racks], hall, grid)
         for quantity, values in block.halls.items():
             colours = colour_scales.colours_of(scales[quantity])
             voxels = colours[colour_scales.classes_of(values[:, levels], scales[quantity])]
