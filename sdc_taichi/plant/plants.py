@@ -200,11 +200,11 @@ class _TowerLoop:
         alone_c = np.maximum(nearest_c, design.min_condenser_c)
         precooled_c = np.maximum(nearest_c, useful_c)
         if self.devices.tower.water_loop:
-            # The economiser may take heat of the coils that the chiller does not.
-            coils_w = self.taken_w
+            heat_w = self._chiller(self.taken_w, alone_c).rejected_w
             if self.point.warmed_k is not None:
-                coils_w = coils_w - warmth_w(self.point.warmed_k, design)
-            heat_w = np.maximum(self._chiller(self.taken_w, alone_c).rejected_w, coils_w)
+                # The economiser may take heat of the coils that the chiller does not.
+                coils_w = self.taken_w - warmth_w(self.point.warmed_k, design)
+                heat_w = np.maximum(heat_w, np.minimum(coils_w, self._largest_load_w()))
             by_lift = (
                 design.idle_w_per_w_k * design.chiller_w + design.load_w_per_w_k * self.taken_w
             )
