@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -416,6 +417,36 @@ def large_recording(quick: bool) -> Iterator[Figure]:
     yield Figure("recording", f"{name}, file per step", size_kb, "kB", at_most=20.0)
 
 
+def rack_histories(quick: bool) -> Iterator[Figure]:
+    """Runs that write a history of racks in every step, over the same run without it."""
+    from sdc_taichi.control import make_controller
+    from sdc_taichi.run.description import RunRequest
+    from sdc_taichi.run.folder_writer import simulate_to_folder
+    from sdc_taichi.run.rack_history import history_request
+
+    count, rounds, racks = (4, 1, 5) if quick else (960, 7, 40)
+    requests = {
+        "without": None,
+        "all racks": history_request(None, "every=step"),
+        "the ten hottest racks": history_request("hottest:10", "every=step"),
+    }
+    config = sdc_taichi.load_config("large", ["hall.rows=25", f"hall.racks_per_row={racks}"])
+    with tempfile.TemporaryDirectory() as folder, sdc_taichi.Simulator(config) as sim:
+        controller = make_controller("idle", sim.fleet)
+
+        def simulate(name: str) -> None:
+            out, history = Path(folder, name), requests[name]
+            simulate_to_folder(sim, controller, RunRequest("idle", count), out, history=history)
+
+        spent_s = core_s({name: partial(simulate, name) for name in requests}, rounds)
+        where = f"{sim.fleet.racks:,} racks"
+    for name in [*requests][1:]:
+        ratio = float(np.median(spent_s[name] / spent_s["without"]))
+        beside = f"{number(1e3 * float(np.median(spent_s[name])) / count)} ms/step"
+        figure = f"history of {name}, {where}"
+        yield Figure("recording", figure, ratio, at_most=1.25, absolute=beside)
+
+
 def simulated(
     count: int, days: int, file: Path | None, made: contextlib.ExitStack
 ) -> Callable[[], None]:
@@ -542,7 +573,7 @@ def main() -> None:
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
     parts = environments, planned, kernel_and_peer, halls, calls, scaling, starting, optima
-    for part in (*parts, recording, large_recording):
+    for part in (*parts, recording, large_recording, rack_histories):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

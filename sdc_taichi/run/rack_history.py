@@ -25,7 +25,7 @@ from sdc_taichi.run.steps_file import METADATA_KEY
 from sdc_taichi.run.time_column import time_column
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F32, F64, I64, StepResult
+from sdc_taichi.types import F32, F64, I64, Reals, Status, StepResult
 
 RACK_HISTORY_FILE = "racks.parquet"
 """Name of the history of racks in a run folder."""
@@ -159,7 +159,9 @@ def check_history(request: HistoryRequest, fleet: Fleet, steps: int, out: Path) 
     # The hottest racks are known at the end of the run, so until then all racks are stored.
     racks = fleet.racks if whole_halls else len(_chosen(request, fleet, None))
     shares = int(np.diff(fleet.unit_offsets).max()) if request.unit_shares else 0
-    size = racks * intervals * (BYTES_PER_ROW + BYTES_PER_SHARE * shares)
+    size = intervals * racks * (BYTES_PER_ROW + BYTES_PER_SHARE * shares)
+    if request.racks is not None and request.racks.needs_inlets:
+        size = intervals * _record(len(QUANTUMS) + shares, racks).itemsize
     require_room(
         out / RACK_HISTORY_FILE,
         size,
@@ -224,21 +226,17 @@ class RackHistoryWriter:
         }
         units = int(np.diff(self._fleet.unit_offsets).max()) if request.unit_shares else 0
         self._names = (*QUANTUMS, *(f"unit_{unit}_share" for unit in range(units)))
-        self._quantums = np.full((len(self._names), 1), _SHARE_QUANTUM, dtype=np.float32)
-        self._quantums[: len(QUANTUMS), 0] = [*QUANTUMS.values()]
-        count = max(1, _ROWS_PER_GROUP // max(1, len(self._racks)))
-        shape = (len(self._names), len(self._racks))
-        self._sums: F64 = np.zeros(shape)
-        self._worst = np.zeros(len(self._racks), dtype=np.int8)
-        self._steps_in_interval = 0
-        self._values: F32 = np.empty((count, *shape), dtype=np.float32)
-        self._status = np.empty((count, len(self._racks)), dtype=np.int8)
-        self._first_steps = np.empty(count, dtype=np.int64)
-        self._filled = 0
+        self._block = np.empty(
+            _intervals_per_group(self._racks), _record(len(self._names), len(self._racks))
+        )
+        self._filled = self._intervals_written = self._steps_in_interval = 0
+        # The values of a single step need no sums.
+        self._sums: F64 = np.empty((len(self._names) if self._every > 1 else 0, len(self._racks)))
         self._highest_c = np.full(self._fleet.racks, -np.inf)
         self._writer: Any = None
         self._output = AtomicFile(path)
-        # Until the hottest racks are known, the rows of all racks are in a file without a name.
+        # Until the hottest racks are known, the values of all racks are in a file without a name.
+        # It is not compressed, because that takes a third of the time of a step.
         self._scratch: IO[bytes] | None = None
         if self._needs_choice:
             with naming_errors(path):
@@ -250,9 +248,7 @@ class RackHistoryWriter:
         Raises:
             SdcError: The file cannot be written.
         """
-        sums, racks = self._sums, self._racks
-        if self._steps_in_interval == 0:
-            self._first_steps[self._filled] = result.step
+        racks, is_first = self._racks, self._steps_in_interval == 0
         hottest_c = result.rack_inlet_max_c
         rows = (
             result.rack_inlet_c,
@@ -263,20 +259,22 @@ class RackHistoryWriter:
         )
         chosen = rows if self._is_whole else tuple(row[racks] for row in rows)
         status = result.rack_status if self._is_whole else result.rack_status[racks]
-        if self._steps_in_interval == 0:
+        interval = self._block[self._filled]
+        values = interval["values"] if self._every == 1 else self._sums
+        if is_first:
             for index, row in enumerate(chosen):
-                sums[index] = row
-            self._worst[:] = status
+                values[index] = row
+            interval["status"][:] = status
         else:
             for index, row in enumerate(chosen):
                 if index == 1:
-                    np.maximum(sums[index], row, out=sums[index])
+                    np.maximum(values[index], row, out=values[index])
                 else:
-                    sums[index] += row
-            np.maximum(self._worst, status, out=self._worst)
+                    values[index] += row
+            np.maximum(interval["status"], status, out=interval["status"])
         if self._request.unit_shares:
-            shares = sums[len(chosen) :]
-            if self._steps_in_interval == 0:
+            shares = values[len(chosen) :]
+            if is_first:
                 shares[:] = 0.0
             self._add_shares(shares)
         if self._needs_choice:
@@ -293,11 +291,11 @@ class RackHistoryWriter:
         """
         if self._steps_in_interval:
             self._end_interval()
-        self._write_row_group()
+        self._end_block()
+        if self._scratch is not None:
+            self._write_hottest(self._scratch)
         with naming_errors(self._output.path):
             self._writer.close()
-            if self._scratch is not None:
-                self._keep_hottest(self._scratch)
         self._output.commit()
 
     def __enter__(self) -> Self:
@@ -308,7 +306,7 @@ class RackHistoryWriter:
         if self._scratch is not None:
             self._scratch.close()
 
-    def _add_shares(self, sums: F64) -> None:
+    def _add_shares(self, sums: Reals) -> None:
         """Add the shares of the CRAC units in the supply air of each rack, (U, R), to sums."""
         fleet, weight = self._fleet, self._sim.intake_air().unit_weight
         shares = np.ones((fleet.racks, len(sums)))
@@ -323,27 +321,52 @@ class RackHistoryWriter:
         sums += shares[self._racks].T
 
     def _end_interval(self) -> None:
-        """Store the means, highest inlets and worst statuses of an interval."""
-        means = self._sums / self._steps_in_interval
-        means[1] = self._sums[1]
-        block = self._values[self._filled]
-        np.divide(means, self._quantums, out=block, casting="same_kind")
-        np.rint(block, out=block)
-        block *= self._quantums
-        self._status[self._filled] = self._worst
+        """Store the means and highest inlets of an interval."""
+        if self._every > 1:
+            values = self._block[self._filled]["values"]
+            np.divide(self._sums, self._steps_in_interval, out=values, casting="same_kind")
+            values[1] = self._sums[1]
         self._filled += 1
         self._steps_in_interval = 0
-        if self._filled == len(self._values):
-            self._write_row_group()
+        if self._filled == len(self._block):
+            self._end_block()
 
-    def _write_row_group(self) -> None:
-        """Write the intervals since the last row group, if any, as a new row group."""
+    def _end_block(self) -> None:
+        """Write the intervals since the last block, if any, to the table or the scratch file."""
+        block, self._filled = self._block[: self._filled], 0
+        if self._scratch is None:
+            self._write_row_group(self._racks, block["values"], block["status"])
+        else:
+            with naming_errors(self._output.path):
+                self._scratch.write(block.view(np.uint8).data)
+
+    def _write_hottest(self, scratch: IO[bytes]) -> None:
+        """Write the rows of the racks that were hottest over the run from the scratch file."""
+        with naming_errors(self._output.path):
+            scratch.flush()
+            stored = np.memmap(scratch, self._block.dtype, mode="r")
+        racks = _chosen(self._request, self._fleet, self._highest_c)
+        count = _intervals_per_group(racks)
+        for first in range(0, len(stored), count):
+            block = stored[first : first + count]
+            values = block["values"][:, :, racks]
+            self._write_row_group(racks, values, block["status"][:, racks])
+
+    def _write_row_group(self, racks: I64, values: F32, status: Status) -> None:
+        """Write the next intervals, if any, as a row group.
+
+        Args:
+            racks: Indices of the K racks in the fleet, (K,).
+            values: Quantities of ``self._names`` in each interval, (intervals, quantities, K).
+            status: Worst status of each rack in each interval, (intervals, K).
+        """
         import pyarrow as pa
 
-        count, fleet, racks = self._filled, self._fleet, self._racks
+        count, fleet = len(values), self._fleet
         if count == 0:
             return
-        steps, dcs = self._first_steps[:count], fleet.rack_dc[racks]
+        steps = self._every * np.arange(self._intervals_written, self._intervals_written + count)
+        dcs = fleet.rack_dc[racks]
         times = time_column(self._sim.drivers, steps, fleet.steps_per_hour)
         index = (np.arange(count)[:, None] * fleet.size + dcs).reshape(-1)
         rack = racks - fleet.rack_offsets[dcs]
@@ -358,30 +381,29 @@ class RackHistoryWriter:
             "row": np.tile((rack // per_row[dcs]).astype(np.int32), count),
             "rack": np.tile(rack.astype(np.int32), count),
         }
-        for name, values in zip(self._names, self._values.transpose(1, 0, 2), strict=True):
-            columns[name] = values[:count].reshape(-1)
-        columns["status"] = self._status[:count].reshape(-1)
+        for number, name in enumerate(self._names):
+            quantum = np.float32(QUANTUMS.get(name, _SHARE_QUANTUM))
+            column = values[:, number] / quantum
+            np.rint(column, out=column)
+            column *= quantum
+            columns[name] = column.reshape(-1)
+        columns["status"] = status.reshape(-1)
         group = pa.table(columns).replace_schema_metadata(self._metadata)
         with naming_errors(self._output.path):
             if self._writer is None:
-                file = self._output.file if self._scratch is None else self._scratch
-                self._writer = parquet_writer(file, group.schema)
+                self._writer = parquet_writer(self._output.file, group.schema)
             self._writer.write_table(group)
-        self._filled = 0
+        self._intervals_written += count
 
-    def _keep_hottest(self, scratch: IO[bytes]) -> None:
-        """Copy the rows of the racks that were hottest over the run from the scratch file."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
 
-        racks = _chosen(self._request, self._fleet, self._highest_c)
-        scratch.seek(0)
-        stored = pq.ParquetFile(scratch)
-        with parquet_writer(self._output.file, stored.schema_arrow) as writer:
-            for number in range(stored.num_row_groups):
-                group = stored.read_row_group(number)
-                first = np.arange(0, group.num_rows, self._fleet.racks)[:, None]
-                writer.write_table(group.take(pa.array((first + racks).reshape(-1))))
+def _record(names: int, racks: int) -> np.dtype[np.void]:
+    """Return the layout of an interval in memory and in the scratch file."""
+    values, status = (np.float32, (names, racks)), (np.int8, (racks,))
+    return np.dtype([("values", *values), ("status", *status)], align=True)
+
+
+def _intervals_per_group(racks: I64) -> int:
+    return max(1, _ROWS_PER_GROUP // max(1, len(racks)))
 
 
 def parquet_writer(file: IO[bytes], schema: Any) -> Any:
