@@ -224,7 +224,7 @@ class HottestRow:
             numbers = np.arange(1, len(names) + 1, dtype=np.uint16)
             numbers = numbers.repeat(self._down if axis == 0 else self._across)
             grid = np.broadcast_to(numbers[:, None] if axis == 0 else numbers, (height, width))
-            infos = [rr.AnnotationInfo(i, name, (0, 0, 0, 0)) for i, name in enumerate(names, 1)]
+            infos = [rr.AnnotationInfo(i, name, 0) for i, name in enumerate(names, 1)]
             yield f"{self._path}/{entity}", rr.AnnotationContext(infos)
             image = rr.SegmentationImage(np.ascontiguousarray(grid), opacity=1.0, draw_order=-100.0)
             yield f"{self._path}/{entity}", image

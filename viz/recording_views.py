@@ -412,7 +412,7 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
             for row in range(hall.rows)
         ]
     # Names are drawn in no colour behind the maps, only for the pointer.
-    invisible = [rr.AnnotationInfo(i, name, (0, 0, 0, 0)) for i, name in enumerate(names, 1)]
+    invisible = [rr.AnnotationInfo(i, name, 0) for i, name in enumerate(names, 1)]
     yield f"{path}/map/racks", rr.AnnotationContext(invisible)
     numbers = rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0)
     yield f"{path}/map/racks", numbers
