@@ -55,6 +55,8 @@ class RackHistory:
         self._per_kw = _MAX_NUMBER / largest_kw
         self._capacity = max(LEAST_STEPS, MAX_BYTES // (6 * (last - first)) // 2 * 2)
         self._stride = 1
+        self._peak = np.zeros(last - first, np.uint16)
+        """Number of the highest inlet of each rack, (R,)."""
         self._unreduced: list[tuple[int, tuple[npt.NDArray[np.floating], ...]]] = []
         self._unreduced_bytes = 0
         self._steps: list[int] = []
@@ -72,8 +74,7 @@ class RackHistory:
     def peak_inlet_c(self) -> F64:
         """Return the highest inlet of each rack over the run, in C, (R,)."""
         self._reduce()
-        highest = np.maximum.reduce([numbers[0] for numbers in [*self._numbers, *self._pending]])
-        return np.asarray(highest / PER_K + LOWEST_C, np.float64)
+        return np.asarray(self._peak / PER_K + LOWEST_C, np.float64)
 
     def at(self, step: int) -> RackValues | None:
         """Return the values of all racks at a step, or the highest of the steps kept with it.
@@ -129,6 +130,7 @@ class RackHistory:
              _numbers(cpu_w + fan_w, 0.0, self._per_kw * 1e-3)],
             axis=1,
         )  # fmt: skip
+        self._peak = np.maximum(self._peak, numbers[:, 0].max(axis=0))
         for (step, _), frame in zip(buffered, numbers, strict=True):
             self._steps.append(step)
             self._keep(frame)
@@ -138,7 +140,7 @@ class RackHistory:
         self._pending.append(frame)
         if len(self._pending) < self._stride:
             return
-        self._numbers.append(np.maximum.reduce(self._pending))
+        self._numbers.append(np.maximum.reduce(self._pending) if self._stride > 1 else frame)
         self._pending = []
         if len(self._numbers) >= self._capacity:
             pairs = zip(self._numbers[::2], self._numbers[1::2], strict=True)

@@ -17,12 +17,13 @@ import numpy.typing as npt
 import rerun as rr
 
 from sdc_taichi.config import HallConfig
+from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, Inlets, intake_air_of
 from sdc_taichi.types import F32, F64, I64, Reals, StepResult
 
-from .colour_scales import ColourScale, annotation_context, classes_of
+from .colour_scales import ColourScale, annotation_context, classes_of, named_classes
 from .hall_rasters import tile_grid
 from .recording_frames import (
     Columns,
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 NEW_MAXIMUM_K = 0.5
 """Rise of the hottest inlet above that of all earlier frames, in K, that causes another frame."""
+TOLERANCE_K = 1.0
+"""Change of an inlet of the hottest racks, in K, that causes another frame of the close-ups."""
 STRENGTH_TOLERANCE = 0.02
 """Change of a unit's supply, relative to that of the strongest unit, that changes the share map."""
 BANDS = ("up to 25 %", "25 to 50 %", "50 to 75 %", "more than 75 %")
@@ -91,14 +94,14 @@ def share_classes(unit: I64, share: F64) -> npt.NDArray[np.uint16]:
 
 def share_legend(units: int) -> rr.AnnotationContext:
     """Return name and colour of each class of the share map of a hall with that many units."""
-    infos = [rr.AnnotationInfo(NO_UNIT, "no supply air", (0, 0, 0))]
+    names, colours = ["no supply air"], [0x000000FF]
     for unit in range(units):
         full = np.array(rgb(UNIT_COLOURS[unit % len(UNIT_COLOURS)]), dtype=np.float64)
-        for band, (name, grey) in enumerate(zip(BANDS, _GREY_SHARES, strict=True)):
-            colour = np.rint(grey * _GREY_RGB + (1.0 - grey) * full).astype(int).tolist()
-            number = 1 + unit * len(BANDS) + band
-            infos.append(rr.AnnotationInfo(number, f"CRAC {unit} gives {name}", colour))
-    return rr.AnnotationContext(infos)
+        for name, grey in zip(BANDS, _GREY_SHARES, strict=True):
+            red, green, blue = np.rint(grey * _GREY_RGB + (1.0 - grey) * full).astype(int).tolist()
+            names.append(f"CRAC {unit} gives {name}")
+            colours.append(red << 24 | green << 16 | blue << 8 | 0xFF)
+    return named_classes(names, colours, first=NO_UNIT)
 
 
 class Arrows(NamedTuple):
@@ -221,9 +224,11 @@ class _Exhaust(NamedTuple):
 class AirflowPictures:
     """Share map and close-ups of one data center with recirculation.
 
-    Frames are recorded at the times of the 3D hall, when failures or other events begin or end, and
-    when the hottest inlet exceeds that of all earlier frames by ``NEW_MAXIMUM_K``. The share map is
-    recorded when the strength of a unit has changed by ``STRENGTH_TOLERANCE``.
+    Frames may be recorded at the times of the 3D hall, when failures or other events begin or end,
+    and when the hottest inlet exceeds that of all earlier frames by ``NEW_MAXIMUM_K``. Of these,
+    the share map is recorded when the strength of a unit has changed by ``STRENGTH_TOLERANCE``, and
+    the close-ups when other racks are the hottest, or an inlet of these has changed by
+    ``TOLERANCE_K``.
 
     Args:
         sim: the simulator.
@@ -241,6 +246,10 @@ class AirflowPictures:
         self._active: Sequence[ActiveEvent] | None = None
         self._hottest_c = -np.inf
         self._strength: F64 | None = None
+        self._shown: I64 | None = None
+        """The hottest racks in the latest frame of the close-ups, hottest first."""
+        self._shown_c: Reals | None = None
+        """Their inlets, in C."""
         self._marks: Frames[_UnitMarks] = Frames()
         self._shares: Frames[npt.NDArray[np.uint16]] = Frames()
         self._exhaust: Frames[_Exhaust] = Frames()
@@ -264,22 +273,44 @@ class AirflowPictures:
         is_due = result.step % every == 0 or hottest_c > self._hottest_c + NEW_MAXIMUM_K
         if (not is_due and active == self._active) or not np.isfinite(hottest_c):
             return
-        if active != self._active:
+        is_other_event = active != self._active
+        if is_other_event:
             self._marks.append(result.step, self._unit_marks(active))
         self._active, self._hottest_c = active, max(self._hottest_c, hottest_c)
         air = self._sim.intake_air()
         if len(self._sim.fleet.configs) > 1:
             air = intake_air_of(self._sim.fleet, air, self._dc)
-        inlets = Inlets(self._sim.fleet, self._dc, air)
         strength = air.unit_weight * air.fresh_ratio
         strength /= max(strength.max(), 1e-30)
-        if self._strength is None or not np.allclose(
-            strength, self._strength, rtol=0.0, atol=STRENGTH_TOLERANCE
-        ):
+        has_other_shares = (
+            self._strength is None or np.abs(strength - self._strength).max() > STRENGTH_TOLERANCE
+        )
+        has_other_racks = self._has_other_racks(result.rack_inlet_max_c[self._racks])
+        if not (has_other_shares or has_other_racks or is_other_event):
+            return
+        inlets = Inlets(self._sim.fleet, self._dc, air)
+        if has_other_shares:
             self._shares.append(result.step, share_classes(*inlets.main_units()))
             self._strength = strength
-        parts = [inlets.parts(rack) for rack in inlets.hottest(HOTTEST_RACKS)]
-        self._exhaust.append(result.step, self._sources(parts, result.rack_inlet_max_c))
+        if has_other_racks or is_other_event:
+            parts = [inlets.parts(rack) for rack in inlets.hottest(HOTTEST_RACKS)]
+            self._exhaust.append(result.step, self._sources(parts, result.rack_inlet_max_c))
+
+    def _has_other_racks(self, inlet_c: Reals) -> bool:
+        """Return True if the hottest racks or their inlets differ from the latest close-ups.
+
+        Args:
+            inlet_c: hottest inlet of each rack of the hall, in C, (R,).
+        """
+        hottest = np.argsort(-rank(inlet_c), kind="stable")[:HOTTEST_RACKS]
+        if self._shown is not None and self._shown_c is not None:
+            change_k = np.abs(inlet_c[self._shown] - self._shown_c)
+            if set(hottest.tolist()) == set(self._shown.tolist()) and (
+                change_k.max() < TOLERANCE_K
+            ):
+                return False
+        self._shown, self._shown_c = hottest, inlet_c[hottest]
+        return True
 
     def _sources(self, parts: Sequence[InletParts], inlet_c: Reals) -> _Exhaust:
         """Return where the exhaust before the hottest racks comes from.

@@ -15,7 +15,7 @@ from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.hall.rack_selection import RackSelection, default_racks
 from sdc_taichi.types import F64, I64, Reals
 
-from .colour_scales import ColourScale, annotation_context, classes_of
+from .colour_scales import ColourScale, annotation_context, classes_of, invisible_names
 from .hall_rasters import TileGrid
 from .rack_histories import RackHistory, thinned
 from .recording_series import GREY, PALETTE, RED
@@ -224,8 +224,7 @@ class HottestRow:
             numbers = np.arange(1, len(names) + 1, dtype=np.uint16)
             numbers = numbers.repeat(self._down if axis == 0 else self._across)
             grid = np.broadcast_to(numbers[:, None] if axis == 0 else numbers, (height, width))
-            infos = [rr.AnnotationInfo(i, name, 0) for i, name in enumerate(names, 1)]
-            yield f"{self._path}/{entity}", rr.AnnotationContext(infos)
+            yield f"{self._path}/{entity}", invisible_names(names)
             image = rr.SegmentationImage(np.ascontiguousarray(grid), opacity=1.0, draw_order=-100.0)
             yield f"{self._path}/{entity}", image
         yield f"{self._path}/labels", self._labels(columns, height, width)

@@ -17,7 +17,7 @@ from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.sim.fleet import Fleet
 
 from . import hall_rasters as rasters
-from .colour_scales import ColourScale, annotation_context
+from .colour_scales import ColourScale, annotation_context, invisible_names
 from .recording_racks import TRENDS, mark_entities
 from .recording_series import (
     COMMAND_STATES,
@@ -412,8 +412,7 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
             for row in range(hall.rows)
         ]
     # Names are drawn in no colour behind the maps, only for the pointer.
-    invisible = [rr.AnnotationInfo(i, name, 0) for i, name in enumerate(names, 1)]
-    yield f"{path}/map/racks", rr.AnnotationContext(invisible)
+    yield f"{path}/map/racks", invisible_names(names)
     numbers = rr.SegmentationImage(rasters.rack_numbers(grid), opacity=1.0, draw_order=-100.0)
     yield f"{path}/map/racks", numbers
 
