@@ -176,16 +176,17 @@ def named_classes(
     import pyarrow as pa
     import rerun as rr
 
-    no_keypoints = {"keypoint_annotations": [], "keypoint_connections": []}
-    classes = [
-        {"class_id": i, "class_description": {"info": info, **no_keypoints}}
-        for i, info in (
-            (i, {"id": i, "label": name, "color": colour})
-            for i, (name, colour) in enumerate(zip(names, colours, strict=True), first)
-        )
-    ]
     arrow_type = rr.components.AnnotationContextBatch([]).as_arrow_array().type
-    return rr.AnnotationContext.from_fields(context=pa.array([classes], arrow_type))
+    id_field, class_field = arrow_type.value_type
+    info_field, *keypoint_fields = class_field.type
+    numbers = pa.array(np.arange(first, first + len(names)), id_field.type)
+    columns = [numbers, pa.array(names), pa.array(np.asarray(colours, np.uint32))]
+    info = pa.StructArray.from_arrays(columns, fields=list(info_field.type))
+    no_keypoints = [pa.array([[]] * len(names), field.type) for field in keypoint_fields]
+    described = pa.StructArray.from_arrays([info, *no_keypoints], fields=list(class_field.type))
+    classes = pa.StructArray.from_arrays([numbers, described], fields=[id_field, class_field])
+    context = pa.ListArray.from_arrays([0, len(names)], classes, type=arrow_type)
+    return rr.AnnotationContext.from_fields(context=context)
 
 
 def parse_inlet_range(text: str) -> InletRange:
