@@ -425,6 +425,60 @@ def test_interrupted_run_leaves_whole_files(tmp_path: Path, number: signal.Signa
     assert steps["it_kwh"].sum() == pytest.approx(report["total"]["it_kwh"], rel=1e-10)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+@pytest.mark.parametrize(
+    ("call_of", "calls", "arguments", "files"),
+    [
+        ("sdc_taichi.run.rack_history:RackHistoryWriter.add", 6,
+         "simulate tiny --days 9 --rack-history every=step --out run2", FILES | {"config.yaml"}),
+        ("sdc_taichi.run.rack_history:RackHistoryWriter.add", 6,
+         "simulate tiny --days 9 --racks hottest:2 --out run2", FILES | {"config.yaml"}),
+        ("sdc_taichi.run.export:_local_times", 1, "export run --to csv --out run2/x.csv", set()),
+        ("sdc_taichi.run.export:_utc_texts", 1, "export run --to bms --out run2/x.csv", set()),
+        ("zipfile:ZipFile.write", 3, "export run --to xlsx --out run2/x.xlsx", set()),
+        ("sdc_taichi.run.rack_places:_solve", 2,
+         "hall place hall_of_2026 --type gpu_dense --count 6 --replace storage --out run2/x.png",
+         set()),
+    ],
+)  # fmt: skip
+def test_interrupted_command_leaves_nothing_half_written(
+    tmp_path: Path, call_of: str, calls: int, arguments: str, files: set[str]
+) -> None:
+    """Ctrl-C comes at a call of a function, so that it comes amid the work."""
+    call("simulate", "tiny", "--days", 0.5, "--out", tmp_path / "run", "--quiet")
+    module, _, name = call_of.partition(":")
+    code = f"""
+import importlib, os, signal, sys
+# Processes of a shell's background jobs ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+*owners, name = {name!r}.split(".")
+owner = importlib.import_module({module!r})
+for each in owners:
+    owner = getattr(owner, each)
+function, left = getattr(owner, name), [{calls}]
+def interrupted(*arguments, **values):
+    left[0] -= 1
+    if left[0] == 0:
+        os.kill(os.getpid(), signal.SIGINT)
+    return function(*arguments, **values)
+setattr(owner, name, interrupted)
+sys.argv = ["sdc-taichi", *{arguments.split()!r}]
+from sdc_taichi.__main__ import main
+main()
+"""
+    (tmp_path / "run2").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    histories = {"racks.parquet"} if files else set()
+    assert names_in(tmp_path / "run2") == files | histories
+    if files:
+        racks = pd.read_parquet(tmp_path / "run2" / "racks.parquet")
+        assert sorted(set(racks["step"])) == [*range(6)]
+
+
 def wait_for(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
     limit = time.monotonic() + 60
     while not ready():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import string
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -429,7 +430,12 @@ def _write_sheets(source: _Source, file: IO[bytes]) -> None:
     _write_texts(about, texts, bold)
     described = {k: v for k, v in source.run.metrics.items() if isinstance(v, str | int | float)}
     _write_texts(book.add_worksheet("run"), [(k, str(v)) for k, v in described.items()], None)
-    book.close()
+    try:
+        book.close()
+    except BaseException as error:
+        # An archive completes itself when its last reference goes, and needs its open file for it.
+        traceback.clear_frames(error.__traceback__)
+        raise
 
 
 def _write_texts(sheet: Any, rows: Sequence[Sequence[str]], first_format: Any) -> None:
