@@ -32,6 +32,8 @@ ROW_ASPECT = 3.0
 """Width of the picture of the hottest row, as a multiple of its height."""
 MARK_RGB = (60, 255, 90)
 """Colour of the mark of the hottest rack, which no palette of the maps contains."""
+MARK_TEXT_RGB = (30, 155, 65)
+"""Colour of its name, a green that is legible on dark and on light backgrounds."""
 UNIT_RGB, DOWN_RGB = (80, 170, 230), (255, 60, 60)
 """Colours of CRAC units that run and of those that are down."""
 _LABEL_RGB = (135, 135, 135)
@@ -118,7 +120,7 @@ def mark_entities(path: str, hall: HallConfig, units: int, grid: TileGrid) -> En
     yield f"{path}/hottest", outline
     # Texts are above and below the map, where they hide no rack and no edge of the view cuts them.
     height, width = grid.image_shape
-    for entity, y, colour in (("hottest_text", -0.16, MARK_RGB), ("down_text", 1.0, DOWN_RGB)):
+    for entity, y, colour in (("hottest_text", -0.16, MARK_TEXT_RGB), ("down_text", 1.0, DOWN_RGB)):
         text = rr.Points2D(
             [(width / 2, y * height)],
             radii=rr.Radius.ui_points(0.5),
@@ -234,7 +236,7 @@ class HottestRow:
         mark = rr.Points2D(
             [self._pixel(int(at), int(place)), (width / 2, -0.25 * height)],
             radii=[-5.0, -0.5],  # negative: points of the screen
-            colors=MARK_RGB,
+            colors=[MARK_RGB, MARK_TEXT_RGB],
             labels=["", f"hottest: {name}, {hottest_c:.1f} C, {clock[int(at)]}"],
             show_labels=True,
         )

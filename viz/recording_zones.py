@@ -27,6 +27,7 @@ from .recording_frames import (
     class_format,
     placed,
 )
+from .recording_racks import MARK_TEXT_RGB
 from .recording_text import rack_place
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ TOLERANCE_K = 0.25
 """Change of a rack's inlet at which the racks of its zone are recorded again, in K."""
 MOST_RACKS_PER_STEP = 6_400
 """Largest number of racks that a step records again, which bounds its size."""
-_LABEL_RGB = (255, 255, 255)
+_LABEL_RGB = (135, 135, 135)  # legible on dark and on light backgrounds
 _TILE_PIXELS = 6
 """Height of the tile of a zone, in pixels, and smallest width."""
 
@@ -167,7 +168,7 @@ class ZonePictures:
         labels = rr.Points2D(corners, radii=0.0, colors=_LABEL_RGB, labels=names, show_labels=True)
         yield "zones/names", labels
         style = rr.Points2D.from_fields(
-            radii=rr.Radius.ui_points(5.0), colors=(255, 255, 255), show_labels=True
+            radii=rr.Radius.ui_points(5.0), colors=MARK_TEXT_RGB, show_labels=True
         )
         yield "zones/hottest", style
         yield "zone_racks", classes

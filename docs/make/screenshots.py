@@ -44,6 +44,8 @@ HOT_SPOT = {
 MAP = "rack inlet [C]"
 """Name of the view with the heat map."""
 BATTERY_SHARE = 0.1
+MARGIN = 8
+"""Margin around the coloured part of the heat maps, in pixels."""
 GREETING_S = 5.0
 """Time for which the viewer shows a note on top of the picture after its start, in s."""
 WAIT_S = 60.0
@@ -159,11 +161,14 @@ def screenshot(viewer: ViewerClient, moment: str, view: str | None = None) -> Im
     return Image.open(io.BytesIO(pictures[-1])).convert("RGB")
 
 
-def crop_to_racks(view: Image.Image) -> Image.Image:
-    """The coloured part of the view of a heat map."""
-    coloured = np.ptp(np.asarray(view).astype(int), axis=2) > 30
+def crop_to_racks(views: Mapping[str, Image.Image]) -> dict[str, Image.Image]:
+    """The part of views of one size that is coloured in any of them, with a margin."""
+    pixels = np.stack([np.asarray(view).astype(int) for view in views.values()])
+    coloured = (np.ptp(pixels, axis=3) > 30).any(axis=0)
     (top, *_, bottom), (left, *_, right) = (np.flatnonzero(coloured.any(axis=a)) for a in (1, 0))
-    return view.crop((int(left), int(top), int(right) + 1, int(bottom) + 1))
+    part = int(left), int(top), int(right) + 1 + MARGIN, int(bottom) + 1 + MARGIN
+    part = max(part[0] - MARGIN, 0), max(part[1] - MARGIN, 0), part[2], part[3]
+    return {name: view.crop(part) for name, view in views.items()}
 
 
 def side_by_side(pictures: Mapping[str, Image.Image], columns: int = 3) -> Image.Image:
@@ -189,13 +194,10 @@ def main(folder: Path) -> None:
         with failing_hall() as sim:
             record(recording, sim)
         with native_viewer(recording) as viewer:
-            maps = {
-                label: crop_to_racks(screenshot(viewer, moment, MAP))
-                for moment, label in HOT_SPOT.items()
-            }
+            maps = {label: screenshot(viewer, moment, MAP) for moment, label in HOT_SPOT.items()}
             time.sleep(GREETING_S)
             whole = screenshot(viewer, BOTH_DOWN)
-    for name, picture in (("failure", whole), ("hot_spot", side_by_side(maps))):
+    for name, picture in (("failure", whole), ("hot_spot", side_by_side(crop_to_racks(maps)))):
         picture.save(folder / f"rerun_{name}.webp", quality=75, method=6)
 
 
