@@ -48,6 +48,8 @@ MAP_TITLES = {
 """Titles of the maps, keyed by quantity."""
 MAX_ROW_LABELS = 5
 """Largest number of labels of rows in the 3D hall; more labels would cover each other."""
+_MAP_BACKGROUND = (20, 20, 20)
+"""Background of maps in all themes, which no colour of a rack matches."""
 _LABEL_RGB = (135, 135, 135)  # a grey that is legible on dark and on light backgrounds
 
 Entities = Iterator[tuple[str, Any]]
@@ -282,6 +284,7 @@ def _rack_map(tab: FocusTab, origin: str, name: str, marks: Sequence[str]) -> An
     return rrb.Spatial2DView(
         origin=origin,
         contents=["$origin/**", *(f"+ {tab.path}/map/{mark}" for mark in marks)],
+        background=_MAP_BACKGROUND,
         name=name,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-edge, width + edge), y_range=(-0.2 * height, 1.15 * height)
