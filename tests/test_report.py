@@ -144,6 +144,9 @@ def test_tables_hold_the_metrics(folder: Path, page: Page) -> None:
     for _, group in report_metrics.METRICS:
         for key, label, unit in group:
             expected = [report_html.metric_text(column, key) for column in columns]
+            if key == "pue_with_losses" and all(c[key] == c["pue"] for c in columns):
+                assert not page.rows(label)
+                continue
             assert [label, unit, *expected] in page.rows(label), key
     assert ["metric", "unit", "ny", NASTY, "all"] in page.rows("metric")
 

@@ -154,10 +154,12 @@ def study_places(
     solved = _solve(fleet, _units_up(fleet))
     limits = _limits(config)
     lost_c = np.full(len(configs), np.nan)
-    lost_short = np.zeros(len(configs))
+    lost_short, lost_airflow = np.zeros(len(configs)), np.zeros(len(configs))
     if keep == "n+1":
         if base_fleet.units < 2:
             raise ConfigError(f"{config.name}: one CRAC unit, so no n+1; valid is --keep n")
+        flow_m3s = base_fleet.unit_design_m3s
+        lost_airflow = solved.airflow_share * flow_m3s.sum() / (flow_m3s.sum() - flow_m3s.max())
         lost_c = np.full(len(configs), -np.inf)
         for unit in range(base_fleet.units):
             running = np.tile(np.arange(base_fleet.units) != unit, len(configs)).astype(float)
@@ -172,6 +174,8 @@ def study_places(
             over.append(f"inlet {inlet_c.max():.1f} C")
         if keep == "n+1" and lost_c[i] > limit_c + LEAST_EXCESS_K:
             over.append(f"{lost_c[i]:.1f} C with a unit down")
+        if keep == "n+1" and lost_airflow[i] > 1 + LEAST_SHORTFALL:
+            over.append(f"airflow {100 * lost_airflow[i]:.0f} % with a unit down")
         if keep == "n+1" and lost_short[i] > 0.0:
             over.append("coils with a unit down")
         candidates.append(
