@@ -411,6 +411,7 @@ def _figures(runs: Sequence[RunFolder]) -> list[Figure]:
         return tuple(total.get(key) for total in totals)
 
     recommended_c = RECOMMENDED_C[1]
+    several_halls = any(len(run.metrics["data_centers"]) > 1 for run in runs)
     # A bill of 0 means that the tariff has no prices.
     bills = tuple(bill or None for bill in a_year("cost"))
     figures = [
@@ -428,7 +429,7 @@ def _figures(runs: Sequence[RunFolder]) -> list[Figure]:
         Figure(
             "inlet_above_27_h",
             f"time with an inlet above {recommended_c:g} °C",
-            "h a year",
+            "hall h a year" if several_halls else "h a year",
             a_year("inlet_above_27_h"),
         ),
     ]
