@@ -75,7 +75,7 @@ def test_points_have_names_utc_times_values_and_units(folder: Path, tmp_path: Pa
     assert list(points.columns) == ["point", "time", "value", "unit"]
     assert points["point"].tolist() == [f"ca/{name}" for name in names] * len(steps)
     assert points["unit"].tolist() == [QUANTITIES[name].unit for name in names] * len(steps)
-    np.testing.assert_array_equal(points["value"], steps[names].to_numpy().reshape(-1))
+    np.testing.assert_allclose(points["value"], steps[names].to_numpy().reshape(-1), rtol=1e-12)
     assert points["time"].iloc[0] == "2018-07-01T08:00:00Z"
     assert (pd.to_datetime(points["time"]) == np.repeat(steps["time"].to_numpy(), 3)).all()
 

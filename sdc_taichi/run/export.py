@@ -5,6 +5,8 @@ Tables are read and written a block at a time, so memory does not grow with the 
 
 from __future__ import annotations
 
+import csv as csv_text
+import io
 import json
 import string
 import traceback
@@ -245,7 +247,6 @@ def _write_csv(source: _Source, file: IO[bytes]) -> None:
     """Write a table as CSV with ISO 8601 times that have the UTC offset of the site."""
     import pyarrow as pa
     import pyarrow.compute as pc
-    from pyarrow import csv
 
     writer = None
     for block in source.blocks():
@@ -263,16 +264,22 @@ def _write_csv(source: _Source, file: IO[bytes]) -> None:
         }
         table = pa.table(columns)
         if writer is None:
-            writer = csv.CSVWriter(file, table.schema, write_options=_csv_options())
+            writer = _csv_writer(file, table.schema)
         writer.write_table(table)
     if writer is not None:
         writer.close()
 
 
-def _csv_options() -> Any:
+def _csv_writer(file: IO[bytes], schema: Any) -> Any:
+    """Write the header of a CSV file, and return the writer of its rows."""
     from pyarrow import csv
 
-    return csv.WriteOptions(quoting_style="needed", quoting_header="needed")
+    # Older versions of pyarrow quote every name of a header.
+    header = io.StringIO()
+    csv_text.writer(header, lineterminator="\n").writerow(schema.names)
+    file.write(header.getvalue().encode())
+    options = csv.WriteOptions(include_header=False, quoting_style="needed")
+    return csv.CSVWriter(file, schema, write_options=options)
 
 
 def _offset_texts(hours: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
@@ -301,7 +308,6 @@ def _check_points(template: str, table: TableName) -> None:
 def _write_points(source: _Source, file: IO[bytes], template: str) -> None:
     """Write one line per value: point name, UTC time, value and unit, in the order of time."""
     import pyarrow as pa
-    from pyarrow import csv
 
     numbers = [source.run.names.index(name) for name in source.dcs]
     configs = read_configs(source.run, numbers)
@@ -344,7 +350,7 @@ def _write_points(source: _Source, file: IO[bytes], template: str) -> None:
                 }
             )
             if writer is None:
-                writer = csv.CSVWriter(file, table.schema, write_options=_csv_options())
+                writer = _csv_writer(file, table.schema)
             writer.write_table(table)
     if writer is not None:
         writer.close()
