@@ -16,13 +16,13 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from sdc_taichi.atomic_file import AtomicFile, naming_errors
+from sdc_taichi.atomic_file import naming_errors
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.hall.rack_selection import RackSelection, parse_racks
 from sdc_taichi.hall.unit_supply import weighted_shares
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.run.steps_file import METADATA_KEY
-from sdc_taichi.run.time_column import time_column
+from sdc_taichi.run.parquet_table import ParquetTable, key_columns
+from sdc_taichi.run.steps_file import KEY_COLUMNS, METADATA_KEY
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Reals, Status, StepResult
@@ -31,7 +31,7 @@ RACK_HISTORY_FILE = "racks.parquet"
 """Name of the history of racks in a run folder."""
 HISTORY_KEY = b"sdc_taichi_history"
 """Metadata key of the length of an interval and the selected racks, as JSON."""
-RACK_KEY_COLUMNS = ("dc", "step", "time", "utc_offset_h", "row", "rack")
+RACK_KEY_COLUMNS = (*KEY_COLUMNS, "row", "rack")
 """Columns that identify a row; all others are quantities."""
 QUANTUMS = {
     "inlet_c": 2.0**-10,
@@ -220,10 +220,6 @@ class RackHistoryWriter:
             "every_steps": self._every,
             "racks": "all" if request.racks is None else _text_of(request.racks),
         }
-        self._metadata = {
-            METADATA_KEY: json.dumps(metadata, allow_nan=False).encode(),
-            HISTORY_KEY: json.dumps(about).encode(),
-        }
         units = int(np.diff(self._fleet.unit_offsets).max()) if request.unit_shares else 0
         self._names = (*QUANTUMS, *(f"unit_{unit}_share" for unit in range(units)))
         self._block = np.empty(
@@ -233,10 +229,20 @@ class RackHistoryWriter:
         # The values of a single step need no sums.
         self._sums: F64 = np.empty((len(self._names) if self._every > 1 else 0, len(self._racks)))
         self._highest_c = np.full(self._fleet.racks, -np.inf)
-        self._writer: Any = None
-        self._output = AtomicFile(path)
+        self._table = ParquetTable(
+            path,
+            {
+                METADATA_KEY: json.dumps(metadata, allow_nan=False).encode(),
+                HISTORY_KEY: json.dumps(about).encode(),
+            },
+            compression="zstd",
+            compression_level=1,
+            use_dictionary=[*RACK_KEY_COLUMNS, "status"],
+            # Rounded measurements compress best if equal bytes of all values are neighbours.
+            use_byte_stream_split=list(self._names),
+        )
         # Until the hottest racks are known, the values of all racks are in a file without a name.
-        # It is not compressed, because that takes a third of the time of a step.
+        # Compression of this file would take a third of the time of a step.
         self._scratch: IO[bytes] | None = None
         if self._needs_choice:
             with naming_errors(path):
@@ -294,15 +300,13 @@ class RackHistoryWriter:
         self._end_block()
         if self._scratch is not None:
             self._write_hottest(self._scratch)
-        with naming_errors(self._output.path):
-            self._writer.close()
-        self._output.commit()
+        self._table.commit()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._output.discard()
+        self._table.discard()
         if self._scratch is not None:
             self._scratch.close()
 
@@ -337,12 +341,12 @@ class RackHistoryWriter:
         if self._scratch is None:
             self._write_row_group(self._racks, block["values"], block["status"])
         else:
-            with naming_errors(self._output.path):
+            with naming_errors(self._table.path):
                 self._scratch.write(block.view(np.uint8).data)
 
     def _write_hottest(self, scratch: IO[bytes]) -> None:
         """Write the rows of the racks that were hottest over the run from the scratch file."""
-        with naming_errors(self._output.path):
+        with naming_errors(self._table.path):
             scratch.flush()
             stored = np.memmap(scratch, self._block.dtype, mode="r")
         racks = _chosen(self._request, self._fleet, self._highest_c)
@@ -360,27 +364,16 @@ class RackHistoryWriter:
             values: Quantities of ``self._names`` in each interval, (intervals, quantities, K).
             status: Worst status of each rack in each interval, (intervals, K).
         """
-        import pyarrow as pa
-
         count, fleet = len(values), self._fleet
         if count == 0:
             return
         steps = self._every * np.arange(self._intervals_written, self._intervals_written + count)
         dcs = fleet.rack_dc[racks]
-        times = time_column(self._sim.drivers, steps, fleet.steps_per_hour)
-        index = (np.arange(count)[:, None] * fleet.size + dcs).reshape(-1)
         rack = racks - fleet.rack_offsets[dcs]
         per_row = np.array([config.hall.racks_per_row for config in fleet.configs])
-        columns: dict[str, Any] = {
-            "dc": pa.DictionaryArray.from_arrays(
-                pa.array(np.tile(dcs.astype(np.int32), count)), pa.array(fleet.names)
-            ),
-            "step": np.repeat(steps, len(racks)),
-            "time": times.take(pa.array(index)),
-            "utc_offset_h": np.tile(self._sim.drivers.utc_offset_h[dcs], count),
-            "row": np.tile((rack // per_row[dcs]).astype(np.int32), count),
-            "rack": np.tile(rack.astype(np.int32), count),
-        }
+        columns = key_columns(fleet, self._sim.drivers, steps, dcs)
+        columns["row"] = np.tile((rack // per_row[dcs]).astype(np.int32), count)
+        columns["rack"] = np.tile(rack.astype(np.int32), count)
         for number, name in enumerate(self._names):
             quantum = np.float32(QUANTUMS.get(name, _SHARE_QUANTUM))
             column = values[:, number] / quantum
@@ -388,11 +381,7 @@ class RackHistoryWriter:
             column *= quantum
             columns[name] = column.reshape(-1)
         columns["status"] = status.reshape(-1)
-        group = pa.table(columns).replace_schema_metadata(self._metadata)
-        with naming_errors(self._output.path):
-            if self._writer is None:
-                self._writer = parquet_writer(self._output.file, group.schema)
-            self._writer.write_table(group)
+        self._table.write(columns)
         self._intervals_written += count
 
 
@@ -404,27 +393,6 @@ def _record(names: int, racks: int) -> np.dtype[np.void]:
 
 def _intervals_per_group(racks: I64) -> int:
     return max(1, _ROWS_PER_GROUP // max(1, len(racks)))
-
-
-def parquet_writer(file: IO[bytes], schema: Any) -> Any:
-    """Open a Parquet writer that is fast for rounded measurements.
-
-    Args:
-        file: File to write to.
-        schema: Arrow schema of the table.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    measured = [field.name for field in schema if pa.types.is_float32(field.type)]
-    return pq.ParquetWriter(
-        file,
-        schema,
-        compression="zstd",
-        compression_level=1,
-        use_dictionary=[field.name for field in schema if field.name not in measured],
-        use_byte_stream_split=measured,
-    )
 
 
 def _chosen(request: HistoryRequest | None, fleet: Fleet, highest_c: F64 | None) -> I64:

@@ -11,9 +11,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, TIE_K, rank
-from sdc_taichi.run.time_column import time_column
+from sdc_taichi.run.parquet_table import ParquetTable, key_columns
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.inlet_parts import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
 from sdc_taichi.sim.simulator import Simulator
@@ -66,16 +65,19 @@ class StepsWriter:
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
         self._fleet, self._drivers = sim.fleet, sim.drivers
-        self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
         self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
         self._names: tuple[str, ...] = ()
         self._values: F64 = np.empty((0, 0, 0))  # Current row group, (columns, steps, B).
         self._filled = 0
         self._first_step = 0
-        self._writer: Any = None
         self._racks = _RackCounts(sim.fleet)
         self._air = HottestAir(sim) if sim.fleet.racks <= MOST_AIR_RACKS else None
-        self._output = AtomicFile(path)
+        self._table = ParquetTable(
+            path,
+            {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()},
+            compression="zstd",
+            use_dictionary=["dc", "utc_offset_h"],
+        )
 
     def add(self, result: StepResult) -> None:
         """Add a step; steps must be added in order.
@@ -107,16 +109,13 @@ class StepsWriter:
         self._write_row_group()
         tables = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
         texts = {key: json.dumps(value, allow_nan=False) for key, value in tables.items()}
-        with naming_errors(self._output.path):
-            self._writer.add_key_value_metadata({k: text.encode() for k, text in texts.items()})
-            self._writer.close()
-        self._output.commit()
+        self._table.commit({key: text.encode() for key, text in texts.items()})
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._output.discard()
+        self._table.discard()
 
     def _air_per_dc(self) -> list[dict[str, Any]]:
         """Return the value for ``AIR_KEY`` from the added steps."""
@@ -127,33 +126,13 @@ class StepsWriter:
 
     def _write_row_group(self) -> None:
         """Write the steps since the last row group, if any, as a new row group."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         if self._filled == 0:
             return
-        count, size = self._filled, self._fleet.size
-        steps = np.arange(self._first_step, self._first_step + count)
-        names = pa.array(self._fleet.names)
-        dc = pa.array(np.tile(np.arange(size, dtype=np.int32), count))
-        columns: dict[str, Any] = {
-            "dc": pa.DictionaryArray.from_arrays(dc, names),
-            "step": np.repeat(steps, size),
-            "time": time_column(self._drivers, steps, self._fleet.steps_per_hour),
-            "utc_offset_h": np.tile(self._drivers.utc_offset_h, count),
-        }
+        steps = np.arange(self._first_step, self._first_step + self._filled)
+        columns = key_columns(self._fleet, self._drivers, steps, np.arange(self._fleet.size))
         for name, values in zip(self._names, self._values, strict=True):
-            columns[name] = values[:count].reshape(-1)
-        group = pa.table(columns).replace_schema_metadata(self._metadata)
-        with naming_errors(self._output.path):
-            if self._writer is None:
-                self._writer = pq.ParquetWriter(
-                    self._output.file,
-                    group.schema,
-                    compression="zstd",
-                    use_dictionary=["dc", "utc_offset_h"],
-                )
-            self._writer.write_table(group)
+            columns[name] = values[: self._filled].reshape(-1)
+        self._table.write(columns)
         self._filled = 0
 
 
