@@ -124,6 +124,8 @@ def study_places(
     types = _checked_types(config, type_name, replaced)
     hall = config.hall
     base_fleet = build_fleet(config)
+    if keep == "n+1" and base_fleet.units < 2:
+        raise ConfigError(f"{config.name}: one CRAC unit, so no n+1; valid is --keep n")
     kw_of = {name: _full_kw(config, name) for name in dict.fromkeys(types)}
     taken = tuple(replaced) or tuple(name for name, kw in kw_of.items() if kw <= FREE_KW)
     if not taken:
@@ -139,7 +141,7 @@ def study_places(
         )
     limit_c = allowable_c(config.protection.ashrae_class)[1]
     limit_c = limit_c if inlet_limit_c is None else inlet_limit_c
-    base = _solve(base_fleet, _units_up(base_fleet))
+    base = _solve(base_fleet, Hall(base_fleet, "f64", samples=False), np.ones(base_fleet.units))
     fixed = _fixed_hall(config, base_fleet, float(base.it_kw[0]) / hall.racks)
     grid = is_open.reshape(hall.rows, hall.racks_per_row)
     positions = _candidates(grid, count, base.rack_inlet_c[0])
@@ -151,25 +153,27 @@ def study_places(
         positions = [positions[i] for i in chosen]
     configs = [_with_racks(fixed, types, racks, type_name, i) for i, racks in enumerate(positions)]
     fleet = build_fleet(configs)
-    solved = _solve(fleet, _units_up(fleet))
+    solver = Hall(fleet, "f64", samples=False)
+    solved = _solve(fleet, solver, np.ones(fleet.units))
+    airflow_share = _needed_airflow_share(fleet, solver)
     limits = _limits(config)
     lost_c = np.full(len(configs), np.nan)
     lost_short, lost_airflow = np.zeros(len(configs)), np.zeros(len(configs))
     if keep == "n+1":
-        if base_fleet.units < 2:
-            raise ConfigError(f"{config.name}: one CRAC unit, so no n+1; valid is --keep n")
         flow_m3s = base_fleet.unit_design_m3s
-        lost_airflow = solved.airflow_share * flow_m3s.sum() / (flow_m3s.sum() - flow_m3s.max())
+        lost_airflow = airflow_share * flow_m3s.sum() / (flow_m3s.sum() - flow_m3s.max())
         lost_c = np.full(len(configs), -np.inf)
         for unit in range(base_fleet.units):
             running = np.tile(np.arange(base_fleet.units) != unit, len(configs)).astype(float)
-            case = _solve(fleet, running)
+            case = _solve(fleet, solver, running)
             lost_c = np.maximum(lost_c, case.rack_inlet_c.max(axis=1))
             lost_short = np.maximum(lost_short, case.cooling_kw - limits.lost_kw(unit))
     candidates = []
     for i, racks in enumerate(positions):
         inlet_c = solved.rack_inlet_c[i]
         over = limits.exceeded(solved, i)
+        if airflow_share[i] > 1 + LEAST_SHORTFALL:
+            over.append(f"airflow {100 * airflow_share[i]:.0f} % of the CRAC units")
         if inlet_c.max() > limit_c + LEAST_EXCESS_K:
             over.append(f"inlet {inlet_c.max():.1f} C")
         if keep == "n+1" and lost_c[i] > limit_c + LEAST_EXCESS_K:
@@ -187,7 +191,7 @@ def study_places(
                 rack_inlet_c=inlet_c,
                 hottest_rack=int(np.argmax(rank(inlet_c))),
                 it_kw=float(solved.it_kw[i]),
-                airflow_share=float(solved.airflow_share[i]),
+                airflow_share=float(airflow_share[i]),
                 lost_unit_c=float(lost_c[i]) if keep == "n+1" else None,
                 exceeded=tuple(over),
             )
@@ -252,16 +256,13 @@ class _Solved:
     """Hottest inlet of each rack, in C, (N, R)."""
     it_kw: F64
     """IT power of each hall, in kW, (N,)."""
-    airflow_share: F64
-    """Airflow that the racks need from the CRAC units, divided by that of all units at full speed,
-    (N,)."""
     cooling_kw: F64
     """Heat of servers and CRAC fans, in kW, (N,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """What the hall as it is can supply and cool."""
+    """Limits of power and cooling of the hall before racks are added."""
 
     cooling_kw: float
     """Heat that plant and coils can remove, in kW."""
@@ -279,7 +280,7 @@ class _Limits:
         return float(np.delete(self.unit_kw, unit).sum())
 
     def exceeded(self, solved: _Solved, index: int) -> list[str]:
-        """Return the limits of power, airflow and cooling that a hall exceeds, in words."""
+        """Return the limits of power and cooling that a hall exceeds, in words."""
         out = []
         facility_kw = solved.it_kw[index] * self.facility_per_it
         if facility_kw > self.grid_kw:
@@ -288,8 +289,6 @@ class _Limits:
             out.append(f"cooling {solved.cooling_kw[index]:,.0f} of {self.cooling_kw:,.0f} kW")
         if solved.it_kw[index] > self.ups_kw * (1 + 1e-6):
             out.append(f"UPS {solved.it_kw[index]:,.0f} of {self.ups_kw:,.0f} kW")
-        if solved.airflow_share[index] > 1 + LEAST_SHORTFALL:
-            out.append(f"airflow {100 * solved.airflow_share[index]:.0f} % of the CRAC units")
         return out
 
 
@@ -380,47 +379,47 @@ def _with_racks(
     return with_values(config, {"name": f"{config.name} {index}", "hall.rack_plan": plan})
 
 
-def _units_up(fleet: Fleet) -> F64:
-    """Return that all CRAC units of a fleet run."""
-    return np.ones(fleet.units)
-
-
-def _solve(fleet: Fleet, running: F64) -> _Solved:
+def _solve(fleet: Fleet, solver: Hall, running: F64) -> _Solved:
     """Solve halls at full load with design supply air.
 
     Args:
         fleet: The halls.
+        solver: Their solver.
         running: 1 for CRAC units that run, 0 for those that are down, (U,).
     """
-    hall = Hall(fleet, "f64", samples=False)
-    supply_c = np.repeat(fleet.values("hall.design_supply_c"), np.diff(fleet.unit_offsets))
-    low = np.repeat(fleet.values("hvac.crac.min_flow_ratio"), np.diff(fleet.unit_offsets))
-    sums = hall.solve(
-        Conditions(
-            supply_c,
-            np.ones(fleet.size),
-            unit_low=low * running,
-            unit_high=running,
-            unit_running=running,
-        )
-    )
+    sums = solver.solve(_conditions(fleet, running, running))
     full_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     share = np.array(sums.units_flow_m3s) / full_m3s
     it_w = np.asarray(sums.cpu_w + sums.it_fan_w, dtype=np.float64)
     fan_w = fleet.values("hvac.crac.fan_w_per_m3s") * full_m3s * share**3
     inlet_c = np.array(sums.rack_inlet_max_c, dtype=np.float64).reshape(fleet.size, -1)
-    # With faster fans the units would deliver what the racks need.
-    need = hall.solve(
-        Conditions(
-            supply_c,
-            np.ones(fleet.size),
-            unit_low=low * running,
-            unit_high=_FAST * running,
-            unit_running=running,
-        )
+    return _Solved(inlet_c, it_w / 1e3, (it_w + fan_w) / 1e3)
+
+
+def _needed_airflow_share(fleet: Fleet, solver: Hall) -> F64:
+    """Return the airflow that racks need, divided by that of all CRAC units at full speed, (N,)."""
+    running = np.ones(fleet.units)
+    # With faster fans the units deliver what the racks need.
+    sums = solver.solve(_conditions(fleet, running, _FAST * running))
+    return np.asarray(sums.units_flow_m3s / fleet.unit_sums(fleet.unit_design_m3s))
+
+
+def _conditions(fleet: Fleet, running: F64, unit_high: F64) -> Conditions:
+    """Return conditions of full load and design supply air.
+
+    Args:
+        fleet: The halls.
+        running: 1 for CRAC units that run, 0 for those that are down, (U,).
+        unit_high: Highest speed of each CRAC fan, as a share of full speed, (U,).
+    """
+    units = np.diff(fleet.unit_offsets)
+    return Conditions(
+        np.repeat(fleet.values("hall.design_supply_c"), units),
+        np.ones(fleet.size),
+        unit_low=np.repeat(fleet.values("hvac.crac.min_flow_ratio"), units) * running,
+        unit_high=unit_high,
+        unit_running=running,
     )
-    need_share = np.array(need.units_flow_m3s) / full_m3s
-    return _Solved(inlet_c, it_w / 1e3, need_share, (it_w + fan_w) / 1e3)
 
 
 def _candidates(is_open: Any, count: int, inlet_c: F64) -> list[tuple[int, ...]]:
