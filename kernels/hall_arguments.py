@@ -149,7 +149,8 @@ DC_DOUBLES = {
     "utilisation": "mean utilisation of the servers, 0..1",
     "room_j": "heat stored in the room relative to the setpoint, J (transient)",
     "room_j_per_k": "heat capacity of the room, J/K (transient)",
-    "coil_limit_w": "heat that the plant can remove; without heat at the coils, W (transient)",
+    "coil_limit_w": "heat that the plant can remove with water at its setpoint and no heat at the "
+    "coils, W (transient)",
     "limit_w_per_k": "growth of that heat with the warmth of the water, W/K (transient)",
     "limit_w_per_w": "growth of that heat with the heat at the coils, W/W (transient)",
     "carried_w": "heat that coils and chilled-water pumps can carry, W (transient)",

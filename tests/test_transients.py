@@ -623,7 +623,7 @@ def test_pumps_run_while_water_and_tank_take_up_the_heat() -> None:
     assert np.all(run["heat_removed_w"][16:22] == 0.0)
     # A tank supplies water at the setpoint, and so needs the flow of before.
     np.testing.assert_allclose(pump_w[16:18, 3], before_w[3], rtol=0.02)
-    # Where the water warms, valves open.
+    # Without a tank the water warms, and the valves of the coils open.
     assert np.all(pump_w[20, :3] > 1.5 * before_w[:3])
     np.testing.assert_allclose(run["hvac_w"][17, 3], (pump_w + run["crac_fan_w"])[17, 3])
 

@@ -38,8 +38,8 @@ MAX_CLASSES = 254
 RANGE_CLASSES = 200
 """Largest number of classes within the range of the colours; the others are beyond its ends."""
 
-# Palettes. Blues and yellows to reds can be told apart with colour vision deficiency; lightness
-# changes steadily within a band and jumps at the limits between bands.
+# Palettes. People with colour vision deficiency can distinguish blues from yellows and reds.
+# Lightness changes steadily within a band and jumps at the limits between bands.
 TOO_COLD = "#4a2a6b", "#9a86bf"
 RECOMMENDED = "#0b2a6f", "#2468b4", "#4fb3c8", "#e3f6d5"
 ALLOWABLE = "#ffd84a", "#f48a1d", "#a50f15"

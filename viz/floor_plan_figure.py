@@ -102,17 +102,14 @@ def floor_plan_figure(
     _draw_racks(axes, page, shown)
     _draw_design_units(axes, page, solved.unit_m3s)
     _label_rows(axes, page)
-    axes.set_title(
+    _add_title_and_legend(
+        axes,
         f"{literal_text(solved.config.name)}: {page.hall.rows} rows of {page.hall.racks_per_row} "
         f"racks, {page.plan.length_m:.4g} x {page.plan.width_m:.4g} m, "
         f"{solved.it_w.sum() / 1e3:,.0f} kW IT, {_airflow_text(solved.unit_m3s.sum())} m³/s supply "
         f"at {solved.supply_c:g} °C",
-        fontsize=10,
-        loc="left",
-        pad=22,
+        columns=4,
     )
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8.5, frameon=False,
-                borderaxespad=0.2, handlelength=1.6)  # fmt: skip
     return figure
 
 
@@ -147,16 +144,20 @@ def places_figure(study: RackPlaces) -> Figure:
         )
     )
     fits = "fits" if not best.exceeded else f"exceeds: {'; '.join(best.exceeded)}"
-    axes.set_title(
+    _add_title_and_legend(
+        axes,
         f"{literal_text(study.config.name)} with {study.count} {literal_text(study.type)} at "
         f"{literal_text(best.places)}: {best.it_kw:,.0f} kW IT, {fits}",
-        fontsize=10,
-        loc="left",
-        pad=22,
+        columns=5,
     )
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize=8.5, frameon=False,
-                borderaxespad=0.2, handlelength=1.6)  # fmt: skip
     return figure
+
+
+def _add_title_and_legend(axes: Axes, title: str, *, columns: int) -> None:
+    """Set the title of a floor plan, and a legend with a number of columns below it."""
+    axes.set_title(title, fontsize=10, loc="left", pad=22)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, fontsize=8.5, frameon=False,
+                borderaxespad=0.2, handlelength=1.6)  # fmt: skip
 
 
 def failover_figure(study: Failover) -> Figure:

@@ -108,11 +108,11 @@ class Arrows(NamedTuple):
     """Arrows to the hottest racks from A racks whose exhaust warms them."""
 
     start: F64
-    """Where the arrows begin, x and y in pixels of the close-ups, (A, 2)."""
+    """Start of each arrow, x and y in pixels of the close-ups, (A, 2)."""
     end: F64
-    """Where the arrows end, x and y in pixels of the close-ups, (A, 2)."""
+    """Tip of each arrow, x and y in pixels of the close-ups, (A, 2)."""
     warming_k: F64
-    """What the exhaust adds to the inlet of the rack at the end, in K, (A,)."""
+    """Warming of the inlet at the tip by the exhaust of the rack at the start, in K, (A,)."""
 
 
 class CloseUps:
@@ -207,7 +207,7 @@ def _left(number: int) -> int:
 
 
 class _Exhaust(NamedTuple):
-    """Where the exhaust before the hottest racks comes from, at one step."""
+    """Close-ups of the hottest racks at one step, with arrows from the racks that warm them."""
 
     image_c: F32
     """Hottest inlet of the racks in the close-ups, in C, (height, width); nan without a rack."""
@@ -422,14 +422,14 @@ class AirflowPictures:
 
 
 def sources_markdown(parts: Sequence[InletParts], per_row: int) -> str:
-    """Return a Markdown table of what warms the inlets of racks.
+    """Return a Markdown table of the parts of the inlet temperatures of racks.
 
     Args:
         parts: parts of the inlet temperature of each rack, hottest first.
         per_row: number of racks in a row of the hall.
     """
     lines = [
-        "| hottest inlets | C | supply air, C | its exhaust, K | exhaust of others, rack: K |",
+        "| rack | inlet, C | supply air, C | exhaust of the rack itself, K | exhaust of rack: K |",
         "|---|---:|---:|---:|---|",
     ]
     for part in parts:

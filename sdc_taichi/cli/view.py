@@ -37,7 +37,7 @@ Runs = Annotated[
     list[str],
     typer.Argument(
         metavar="[NAME=]DIR...",
-        help="Folder of a run, and of others of the same hall; NAME is shown for it.",
+        help="Folders of runs of one hall, each shown as NAME if that is given.",
         show_default=False,
     ),
 ]

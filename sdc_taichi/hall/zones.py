@@ -98,12 +98,3 @@ def hall_zones(hall: HallConfig) -> Zones:
         first_row=np.minimum(first_row, hall.rows),
         first_place=np.arange(sections + 1) * hall.racks_per_row // sections,
     )
-
-
-def zone_text(zones: Zones, zone: int) -> str:
-    """Return number and place of a zone, such as ``zone 3: rows 8 to 15, places 0 to 79``."""
-    rows, places = zones.bounds(zone)
-    text = f"zone {zone}: rows {rows.start} to {rows.stop - 1}"
-    if zones.shape[1] == 1:
-        return text
-    return f"{text}, places {places.start} to {places.stop - 1}"

@@ -43,7 +43,7 @@ class Difference:
     name: str
     """Name of the field or input."""
     meaning: str
-    """What the field is, as a sentence; empty for inputs."""
+    """Description of the field, from its documentation; empty for inputs."""
     values: tuple[str, ...]
     """Value in each run, as text, (R,)."""
 
@@ -55,7 +55,7 @@ class Figure:
     key: str
     """Name of the figure in JSON."""
     label: str
-    """What the figure is."""
+    """Name of the figure for readers, such as ``energy from the grid``."""
     unit: str
     """Unit of the values; empty for a number without unit."""
     values: tuple[float | None, ...]
@@ -98,7 +98,7 @@ class Comparison:
     figures: tuple[Figure, ...]
     """Figures of the runs, those that grow with time for a year."""
     costs: Mapping[str, float]
-    """What a variant costs to make, in the currency of the tariff, keyed by name of the run."""
+    """Cost of building a variant, in the currency of the tariff, keyed by name of the run."""
     redundancy: Mapping[str, Redundancy]
     """Result of failover studies, keyed by name of the run; empty if none were asked for."""
     notes: tuple[str, ...]

@@ -270,7 +270,7 @@ class Inlets:
         hottest_c = np.maximum.reduceat(self._group_inlet_c, self._group_offsets[:-1])
         ranked, chosen = rank(hottest_c), np.arange(self._racks)
         if 0 < most < self._racks:
-            # Of many racks only the hottest are sorted.
+            # Sorting all racks of a large hall would take longer than this selection.
             coldest = np.partition(ranked, self._racks - most)[self._racks - most]
             chosen = np.flatnonzero(ranked >= coldest)
         order = np.argsort(-ranked[chosen], kind="stable")[:most]
