@@ -12,7 +12,7 @@ from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.run.time_column import time_column
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import I64
+from sdc_taichi.types import I32, I64
 
 
 class ParquetTable:
@@ -65,7 +65,7 @@ class ParquetTable:
         self._output.discard()
 
 
-def key_columns(fleet: Fleet, drivers: Drivers, steps: I64, dcs: I64) -> dict[str, Any]:
+def key_columns(fleet: Fleet, drivers: Drivers, steps: I64, dcs: I32 | I64) -> dict[str, Any]:
     """Return data center, step, time and UTC offset of the rows of a table.
 
     The rows are in the order of steps, with K rows for each step.
