@@ -98,6 +98,11 @@ def figure_rows(
     return rows
 
 
+def savings_title(comparison: Comparison) -> str:
+    """Return the title of the table of ``saving_rows``."""
+    return f"Savings a year against {comparison.names[0]}; negative values are increases"
+
+
 def saving_rows(comparison: Comparison, columns: Sequence[int]) -> list[list[str]]:
     """Return a row of cells for each saving against the first run, and the payback of each variant.
 
@@ -135,10 +140,9 @@ def _tables(
     if comparison.differences:
         rows = difference_rows(comparison, columns)
         out.append(table("What differs between the runs", ["field or input", *heads], rows))
-    caption = f"Savings against {names[0]}, in a year; below zero is more than there"
     out.append(
         table(
-            caption,
+            savings_title(comparison),
             ["saving", "unit", *heads[1:]],
             saving_rows(comparison, columns[1:]),
             numbers=range(2, len(columns) + 1),

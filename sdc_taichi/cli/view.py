@@ -101,7 +101,12 @@ def compare_command(
     report with the same folders writes this as an HTML file, with pictures.
     """
     from sdc_taichi.run.comparison import comparison_values, named_runs
-    from sdc_taichi.viz.report_comparison import difference_rows, figure_rows, saving_rows
+    from sdc_taichi.viz.report_comparison import (
+        difference_rows,
+        figure_rows,
+        saving_rows,
+        savings_title,
+    )
 
     comparison = _compare(named_runs(folders), cost, failover=failover)
     if as_json:
@@ -117,7 +122,7 @@ def compare_command(
         figure_rows(comparison, every),
     )
     _print_rows(
-        f"Savings against {names[0]}, in a year; below zero is more than there",
+        savings_title(comparison),
         ["", "unit", *names[1:]],
         saving_rows(comparison, every[1:]),
     )

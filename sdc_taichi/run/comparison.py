@@ -466,8 +466,8 @@ def _notes(
         days = first.hours / 24
         season = "other seasons differ" if years < 1.0 else "they are means over the years"
         notes.append(
-            f"The runs cover {days:,.4g} days. Figures a year are those of the runs times "
-            f"{1 / years:,.4g}; {season}."
+            f"The runs cover {days:,.4g} day{'s' * (days != 1)}. Figures a year are those of the "
+            f"runs times {1 / years:,.4g}; {season}."
         )
     done = {name: run.metrics["total"]["executed_tasks"] for name, run in runs.items()}
     for name in names:
