@@ -2,6 +2,7 @@
 
 ``open_input`` opens a file after checking its kind and size. ``decoding`` converts exceptions of
 the library that parses the content. ``ArrayFile`` checks the shapes of arrays before it reads them.
+``open_parquet`` and ``read_parquet`` read Parquet files without background threads.
 """
 
 from __future__ import annotations
@@ -12,14 +13,18 @@ import math
 import os
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BufferedReader
-from typing import Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 MOST_CONFIG_BYTES = 64_000_000
 """Largest size of a YAML or JSON file of a configuration, in bytes.
@@ -168,6 +173,38 @@ def read_text(
     except UnicodeDecodeError as failed:
         byte = content[failed.start]
         raise error(f"{path}: byte {failed.start} is {byte:#04x}; valid is UTF-8 text") from failed
+
+
+def open_parquet(file: BinaryIO, **options: Any) -> pq.ParquetFile:
+    """Open a Parquet file for ``read_parquet``, without background threads that read ahead.
+
+    Args:
+        file: the file, open for reading.
+        options: further arguments of ``pyarrow.parquet.ParquetFile``.
+    """
+    import pyarrow.parquet as pq
+
+    return pq.ParquetFile(file, pre_buffer=False, **options)
+
+
+def read_parquet(
+    opened: pq.ParquetFile, columns: Sequence[str] | None = None, row_group: int | None = None
+) -> pa.Table:
+    """Read columns of a Parquet file in the calling thread.
+
+    A background thread of PyArrow may still free the bytes it got from a Python file after the read
+    has returned. If the interpreter exits at that moment, as it does soon after Ctrl-C, the thread
+    aborts the process.
+
+    Args:
+        opened: the file, opened with ``open_parquet``.
+        columns: names of the columns; None reads all.
+        row_group: index of the row group; None reads all.
+    """
+    names = None if columns is None else list(columns)
+    if row_group is None:
+        return opened.read(names, use_threads=False)
+    return opened.read_row_group(row_group, names, use_threads=False)
 
 
 class ArrayFile:

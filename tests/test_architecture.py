@@ -128,6 +128,20 @@ def test_modules_of_a_room_do_not_import_each_other_in_a_circle() -> None:
     assert inside == {}, "these modules import each other"
 
 
+def test_parquet_files_are_read_through_one_function() -> None:
+    """Only ``read_parquet`` makes sure that no background thread of PyArrow outlives a read."""
+    readers = {"ParquetFile", "ParquetDataset", "iter_batches", "read_row_group", "read_parquet"}
+    calls = {
+        (room_of(module), called.attr)
+        for module, path in FILES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(called := node.func, ast.Attribute)
+        and (called.attr in readers or ast.unparse(called) == "pq.read_table")
+    }
+    assert calls == {("user_file", "ParquetFile"), ("user_file", "read_row_group")}
+
+
 def test_plant_is_pure_functions() -> None:
     for module, path in FILES.items():
         if room_of(module) != "plant":

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import threading
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -10,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from sdc_taichi.config import load_config, load_json, load_yaml
@@ -19,7 +23,7 @@ from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.sim import snapshot
-from sdc_taichi.user_file import decoding, open_input, read_bytes
+from sdc_taichi.user_file import decoding, open_input, open_parquet, read_bytes, read_parquet
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "weather.epw": read_epw,
@@ -148,3 +152,24 @@ def test_the_number_of_threads_is_one_that_a_machine_has(
     monkeypatch.setenv("SDC_TAICHI_THREADS", text)
     with pytest.raises(SdcError, match="valid is a positive integer up to 1024"):
         runtime._thread_limit()
+
+
+@pytest.mark.parametrize("row_group", [None, 1])
+def test_parquet_files_are_read_in_the_calling_thread(row_group: int | None) -> None:
+    threads = set()
+
+    class Watched(io.BytesIO):
+        """File that notes the threads that read it."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            threads.add(threading.get_ident())
+            return super().read(size)
+
+    file = Watched()
+    table = pa.table({f"column{i}": np.random.default_rng(i).random(2_000) for i in range(40)})
+    pq.write_table(table, file, row_group_size=500)
+    read = read_parquet(open_parquet(file), ["column3", "column7", "column39"], row_group)
+    expected = table.select([3, 7, 39])
+    assert read.equals(expected if row_group is None else expected.slice(500, 500))
+    assert read_parquet(open_parquet(file)).equals(table)
+    assert threads == {threading.get_ident()}

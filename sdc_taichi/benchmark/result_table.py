@@ -22,7 +22,7 @@ from sdc_taichi.learning.evaluation import ALL, METRICS
 from sdc_taichi.learning.split import WEEKS
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
-from sdc_taichi.user_file import decoding
+from sdc_taichi.user_file import decoding, open_parquet, read_parquet
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -113,10 +113,9 @@ def read_rows(content: bytes, path: Path, columns: Mapping[str, Column]) -> pd.D
             missing or exists twice, or a value is not valid; the message names file and column.
     """
     import pandas as pd
-    import pyarrow.parquet as pq
 
     with decoding(path, "a Parquet file"):
-        opened = pq.ParquetFile(io.BytesIO(content))
+        opened = open_parquet(io.BytesIO(content))
     _check_names(opened, path, columns)
     _check_size(opened, path, columns)
     types = {name: opened.schema_arrow.field(name).type for name in columns}
@@ -125,8 +124,8 @@ def read_rows(content: bytes, path: Path, columns: Mapping[str, Column]) -> pd.D
     texts = [name for name in columns if _is_text(types[name])]
     with decoding(path, "a Parquet file"):
         # Texts stay references to distinct texts, because equal texts may be long and many.
-        opened = pq.ParquetFile(io.BytesIO(content), read_dictionary=texts)
-        table = opened.read(columns=list(columns)).select(list(columns))
+        opened = open_parquet(io.BytesIO(content), read_dictionary=texts)
+        table = read_parquet(opened, list(columns)).select(list(columns))
         table.validate(full=True)
     values = {}
     for name, column in columns.items():
@@ -192,12 +191,10 @@ def read_any_rows(
     Raises:
         SdcError: as in ``read_rows``.
     """
-    import pyarrow.parquet as pq
-
     known = {**declared, **METRIC_COLUMNS}
 
     with decoding(path, "a Parquet file"):
-        existing = pq.ParquetFile(io.BytesIO(content)).schema_arrow.names
+        existing = open_parquet(io.BytesIO(content)).schema_arrow.names
     chosen = existing if names is None else [name for name in names if name in existing]
     return read_rows(content, path, {x: known.get(x, other) for x in chosen})
 

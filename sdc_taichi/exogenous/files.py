@@ -29,7 +29,13 @@ from sdc_taichi.exogenous.year_clock import (
     is_leap_day,
     minutes_into_year,
 )
-from sdc_taichi.user_file import MOST_TABLE_BYTES, decoding, open_input
+from sdc_taichi.user_file import (
+    MOST_TABLE_BYTES,
+    decoding,
+    open_input,
+    open_parquet,
+    read_parquet,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,17 +308,15 @@ def read_arrow(path: Path) -> pa.Table:
     Raises:
         DataError: the file is not a readable Parquet file, or has too many rows.
     """
-    import pyarrow.parquet as pq
-
     with (
         open_input(path, MOST_TABLE_BYTES, DataError) as file,
         decoding(path, "a Parquet file", DataError),
     ):
-        opened = pq.ParquetFile(file)
+        opened = open_parquet(file)
         rows = opened.metadata.num_rows
         if rows > MOST_ROWS:
             raise DataError(f"{path}: {rows:,} rows, expected at most {MOST_ROWS:,}")
-        return opened.read()
+        return read_parquet(opened)
 
 
 def read_schema(path: Path) -> pa.Schema:
@@ -321,13 +325,11 @@ def read_schema(path: Path) -> pa.Schema:
     Raises:
         DataError: the file is not a readable Parquet file.
     """
-    import pyarrow.parquet as pq
-
     with (
         open_input(path, MOST_TABLE_BYTES, DataError) as file,
         decoding(path, "a Parquet file", DataError),
     ):
-        return pq.read_schema(file)
+        return open_parquet(file).schema_arrow
 
 
 def mapping_hint(columns: Iterable[object]) -> str:

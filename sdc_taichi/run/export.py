@@ -25,7 +25,7 @@ from sdc_taichi.run.folder_reader import RunFolder, read_configs, read_racks
 from sdc_taichi.run.rack_history import RACK_HISTORY_FILE, RACK_KEY_COLUMNS, require_room
 from sdc_taichi.run.steps_file import KEY_COLUMNS, METADATA_KEY, STEPS_FILE
 from sdc_taichi.types import QUANTITIES, meanings
-from sdc_taichi.user_file import decoding, open_input
+from sdc_taichi.user_file import decoding, open_input, open_parquet, read_parquet
 
 Kind = Literal["csv", "xlsx", "bms"]
 """Kind of an export."""
@@ -129,8 +129,6 @@ class _Source:
     """Rows of a table of a run that an export selects."""
 
     def __init__(self, run: RunFolder, request: ExportRequest) -> None:
-        import pyarrow.parquet as pq
-
         name, self.keys = _FILES[request.table]
         self.run, self.table, self.path = run, request.table, run.path / name
         if request.table == "racks" and not self.path.exists():
@@ -139,7 +137,7 @@ class _Source:
                 "--rack-history"
             )
         with open_input(self.path) as file, decoding(self.path, "a Parquet file"):
-            opened = pq.ParquetFile(file)
+            opened = open_parquet(file)
             schema, rows = opened.schema_arrow, opened.metadata.num_rows
         self._check_run(schema.metadata or {})
         names = tuple(each for each in schema.names if each not in self.keys)
@@ -156,14 +154,13 @@ class _Source:
         """Yield the selected rows as Arrow tables, in the order of the file."""
         import pyarrow as pa
         import pyarrow.compute as pc
-        import pyarrow.parquet as pq
 
         with open_input(self.path) as file:
             with decoding(self.path, "a Parquet file"):
-                opened = pq.ParquetFile(file)
+                opened = open_parquet(file)
             for number in range(opened.num_row_groups):
                 with decoding(self.path, f"row group {number}"):
-                    block = opened.read_row_group(number, columns=[*self.keys, *self.columns])
+                    block = read_parquet(opened, [*self.keys, *self.columns], number)
                 names = pc.cast(block["dc"], pa.string())
                 if len(self.dcs) < len(self.run.names):
                     is_chosen = pc.is_in(names, pa.array(self.dcs))

@@ -26,7 +26,14 @@ from sdc_taichi.run.folder_writer import METRICS_FILE
 from sdc_taichi.run.steps_file import AIR_KEY, KEY_COLUMNS, METADATA_KEY, RACKS_KEY, STEPS_FILE
 from sdc_taichi.run.time_column import zone
 from sdc_taichi.types import F64
-from sdc_taichi.user_file import MOST_METRICS_BYTES, decoding, open_input, read_text
+from sdc_taichi.user_file import (
+    MOST_METRICS_BYTES,
+    decoding,
+    open_input,
+    open_parquet,
+    read_parquet,
+    read_text,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -421,11 +428,9 @@ def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
     Raises:
         SdcError: The file does not exist or is damaged.
     """
-    import pyarrow.parquet as pq
-
     with _part_of_run(), open_input(path) as file:
         with decoding(path, "a Parquet file"):
-            opened = pq.ParquetFile(file)
+            opened = open_parquet(file)
         yield opened
 
 
@@ -466,7 +471,7 @@ def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, np
         done = 0
         for index in range(file.num_row_groups):
             with decoding(path, f"row group {index}"):
-                table = file.read_row_group(index, columns=list(wanted))
+                table = read_parquet(file, wanted, index)
             group = _as_steps(run, index, table, done)
             done += len(group["step"])
             yield group
