@@ -222,6 +222,8 @@ UNIT_STATE = {
     "last_weight_change": "relative change of weight in the last pass",
     "fitted_m3s": "airflow to which weight was fitted, m3/s; -1 for none",
     "strength": "weight to the power of the coupling",
+    "drawn_ratio": "supply air that racks take from the unit / what they would take if all weights "
+    "were 1 (transient)",
     "strength_used": "strength with which the last sweep computed the racks",
     "drawn_m3s": "air of the racks that the unit draws, m3/s (own return air)",
     "return_weight": "weight of the unit in the returns of all racks (own return air)",

@@ -30,10 +30,12 @@ WEIGHT_WITHIN, LEAST_WEIGHT = 1e-9, 1e-12
 MOST_WEIGHT_PASSES, WEIGHT_PRODUCTS, LEAST_WEIGHT_PASSES = 300, 2e8, 20
 """Maximum number of passes over the weights of a data center; if these are more than so many
 products of share and weight, the number of passes for it, but at least the last number."""
-SUPPLY, RETURN, RETURN_HEAT = range(3)
-"""Air that racks exchange with the units: supply air, return air, or the heat of return air."""
+SUPPLY, SUPPLY_NOW, RETURN, RETURN_HEAT = range(4)
+"""Air that racks exchange with the units: supply air at the weights of the units, supply air at
+their present strengths, return air, or the heat of return air."""
 LEAST_NEED_M3S = 1e-6
-"""Need of all racks of a data center below which units have no weights, in m3/s."""
+"""Need of all racks of a data center below which units have no weights, and airflow of a unit below
+which it has no return air of its own, in m3/s."""
 WEIGHTS_EXTRAPOLATED_EVERY = 4
 """Period in passes by which weights that approach their limit slowly are extrapolated."""
 MOST_PASSES = 100
@@ -89,9 +91,11 @@ def unit_need(hall: ti.template(), n, unit):
 @ti.func
 @no_type_check
 def unit_weight(hall: ti.template(), at, air: ti.template()):
-    """Return the weight of a unit in the supply of the racks, or in their returns."""
+    """Return the weight or strength of a unit in the supply or the returns of the racks."""
     weight = hall.units[at].weight
-    if ti.static(air != SUPPLY):
+    if ti.static(air == SUPPLY_NOW):
+        weight = hall.units[at].strength
+    elif ti.static(air != SUPPLY):
         weight = hall.units[at].return_weight
     return weight
 
@@ -111,8 +115,8 @@ def set_unit_weight(hall: ti.template(), at, air: ti.template(), weight):
 def take_from_units(hall: ti.template(), n, of_design, air: ti.template()):
     """Add up, lane by lane, what racks take from each unit per weight of the unit, in m3/s.
 
-    ``air``: SUPPLY, or RETURN for what racks return to each unit, or RETURN_HEAT for the same times
-    its temperature above the return air of the hall, in m3 K/s.
+    ``air``: SUPPLY or SUPPLY_NOW, or RETURN for what racks return to each unit, or RETURN_HEAT for
+    the same times its temperature above the return air of the hall, in m3 K/s.
     """
     dc, unit = hall.dcs[n], 0
     none = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
@@ -128,7 +132,7 @@ def take_from_units(hall: ti.template(), n, of_design, air: ti.template()):
             total += share_of_unit(hall, share_0 + unit, air) * weight
             unit += hall.one
         flow_m3s = none
-        if ti.static(air == SUPPLY):
+        if ti.static(air <= SUPPLY_NOW):
             flow_m3s = hall.plenum[block_at].present_m3s
             if of_design:
                 flow_m3s = hall.plenum[block_at].design_m3s
@@ -151,7 +155,7 @@ def take_from_units(hall: ti.template(), n, of_design, air: ti.template()):
 def share_of_unit(hall: ti.template(), share_at, air: ti.template()):
     """Return the shares of a unit in the supply of the racks of a block, or in their returns."""
     share = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-    if ti.static(air != SUPPLY):
+    if ti.static(air > SUPPLY_NOW):
         share = hall.return_shares[share_at]
     else:
         share = hall.plenum_shares[share_at]
@@ -295,9 +299,10 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
             if not follows:
                 unit.weight = 1.0
             at += hall.one
-        of_design = not follows
-        if ti.static(begins):
-            of_design = True
+    of_design = not follows
+    if ti.static(begins):
+        of_design = True
+    if is_due:
         fit_weights(hall, n, of_design, need_m3s, SUPPLY)
     change, weighs = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     at = dc.first_unit
@@ -307,12 +312,55 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
         change = ti.max(change, ti.abs(strength / unit.strength - 1.0))
         if strength != 1.0:
             weighs = ti.cast(1.0, ti.f64)
-        if strength != unit.strength:
-            dc.shares_due = 1.0
-        unit.strength = strength
         at += hall.one
     dc.weighs = weighs
+    if change > 0.0:
+        dc.shares_due = 1.0
+        if ti.static(hall.transient):
+            take_from_units(hall, n, of_design, SUPPLY_NOW)
+        at = dc.first_unit
+        while at < end_unit:
+            unit = hall.units[at]
+            if ti.static(hall.transient):
+                unit.taken_m3s = unit.strength * sum_lanes(hall.unit_lanes[at])
+            unit.strength = ti.pow(unit.weight, dc.coupling)
+            at += hall.one
+        if ti.static(hall.transient):
+            take_from_units(hall, n, of_design, SUPPLY_NOW)
+            cover_changed_need(hall, n, begins)
     return change
+
+
+@ti.func
+@no_type_check
+def cover_changed_need(hall: ti.template(), n, begins: ti.template()):
+    """Set what the units of a data center cover of a need that changed with their strengths.
+
+    Substeps have no sweeps in which the racks could state their need of each unit anew. It changes
+    by what they take from the unit now divided by ``taken_m3s``, what they took before. ``begins``:
+    the step begins, so fans that follow the need adapt to it within their ranges.
+    """
+    dc, exceeds = hall.dcs[n], ti.cast(0.0, ti.f64)
+    fresh_share, at = ti.cast(dc.fresh_share, ti.f64), dc.first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        factor = unit.strength * sum_lanes(hall.unit_lanes[at]) / ti.max(unit.taken_m3s, 1e-30)
+        unit.drawn_ratio = unit.drawn_ratio * factor
+        unit.need_m3s = unit.need_m3s * factor
+        unit.plain_m3s = unit.plain_m3s * factor
+        fresh_m3s = fresh_share * ti.cast(unit.design_m3s, ti.f64)
+        if ti.static(begins):
+            if dc.follows_need > 0.0:
+                low, high = ti.cast(unit.low, ti.f64), ti.cast(unit.high, ti.f64)
+                unit.speed = ti.min(ti.max(unit.plain_m3s / fresh_m3s, low), high)
+        fresh_m3s *= unit.speed
+        unit.fresh_ratio = ti.min(1.0, fresh_m3s / ti.max(unit.need_m3s, 1e-30))
+        ratio = ti.min(fresh_m3s / ti.max(unit.plain_m3s, 1e-30), MOST_SUPPLY_RATIO)
+        unit.supply_ratio = ratio
+        if dc.oversupply > 0.0 and ratio > 1.0 + COVERED_WITHIN:
+            exceeds = ti.cast(1.0, ti.f64)
+        at += hall.one
+    dc.exceeds = exceeds
 
 
 @ti.func
@@ -353,7 +401,10 @@ def draw_own_return(hall: ti.template(), n, return_c, is_first):
     at = dc.first_unit
     while at < end_unit:
         unit = hall.units[at]
-        unit.return_offset_k = unit.return_offset_k - mean_k
+        unit_m3s = ti.cast(unit.design_m3s, ti.f64) * unit.speed
+        # A unit that moves no air has the return air of the hall.
+        is_drawn = unit_m3s >= LEAST_NEED_M3S
+        unit.return_offset_k = ti.select(is_drawn, unit.return_offset_k - mean_k, 0.0)
         at += hall.one
 
 
@@ -521,8 +572,8 @@ def run_crac_units(hall: ti.template(), n, is_last):
                 flow += unit.flow_m3s
                 cubed += unit.cubed_speed
                 mean_supply_c += unit.mean_supply_c
+        unit.need_m3s = need
         if is_last:
-            unit.need_m3s = need
             unit.following = following
         if is_last or ti.static(not hall.transient):
             unit.fresh_ratio_used = f_used

@@ -339,16 +339,31 @@ class SharedPlenum:
                 self._weights_of_set.clear()
             self._weights_of_set[key] = self._weights(dc, shares, runs)
         self.weight[units] = weight = self._weights_of_set[key]
+        weighted, self.drawn_ratio[units] = self._weighted(dc, weight)
+        by_block = shares_by_block(weighted, self._lanes)
+        first = int(self._first_share[dc])
+        self._kernel_shares[first : first + len(by_block)] = by_block
+
+    def drawn_ratio_at(self, strength: F64) -> F64:
+        """Return ``drawn_ratio`` at other weights of the units in coupled halls, both (U,)."""
+        ratio = np.ones(len(strength))
+        for dc in np.unique(self._fleet.unit_dc[strength != 1.0]):
+            units = slice(*self._fleet.unit_offsets[dc : dc + 2])
+            _, ratio[units] = self._weighted(int(dc), strength[units])
+        return ratio
+
+    def _weighted(self, dc: int, weight: F64) -> tuple[F64, F64]:
+        """Return the shares of a data center's units at given weights, and ``drawn_ratio``."""
+        fleet = self._fleet
+        assert fleet.air is not None
+        at = slice(*fleet.air.unit_share_offsets[dc : dc + 2])
+        shares = fleet.air.unit_shares[at].reshape(-1, len(weight))
         weighted = weighted_shares(shares, weight)
         need_m3s = fleet.air.rack_need_m3s[slice(*fleet.rack_offsets[dc : dc + 2])]
         drawn_m3s, of_all_m3s = need_m3s @ weighted, need_m3s @ shares
         is_drawn = (drawn_m3s > 0) & (of_all_m3s > 0)
-        self.drawn_ratio[units] = np.where(is_drawn, drawn_m3s, 1.0) / np.where(
-            is_drawn, of_all_m3s, 1.0
-        )
-        by_block = shares_by_block(weighted, self._lanes)
-        first = int(self._first_share[dc])
-        self._kernel_shares[first : first + len(by_block)] = by_block
+        drawn_ratio = np.where(is_drawn, drawn_m3s, 1.0) / np.where(is_drawn, of_all_m3s, 1.0)
+        return weighted, drawn_ratio
 
     def _weights(self, dc: int, shares: F64, running: F64) -> F64:
         """Compute the supply weights of the units of a data center, (U,)."""

@@ -448,6 +448,12 @@ class Hall:
         for name in ("coil_c", "casing_c"):
             self._unit_state[name][:] = self._unit_state["supply_c"]
         steady = [row.copy() for row in air]
+        strength = self._unit_state["strength"]
+        drawn_ratio = self._tables.plenum.drawn_ratio_at(strength)
+        for name in ("need_m3s", "plain_m3s"):
+            self._unit_state[name][:] /= drawn_ratio
+        for row in (strength, self._unit_state["drawn_ratio"]):
+            row[:] = 1.0
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin_step(exchanges_before=1)
         self._run_sweeps(
@@ -691,14 +697,19 @@ class Hall:
         of_units = {
             "fresh_ratio": np.minimum(1.0, covers),
             "supply_ratio": np.minimum(ratio, MOST_SUPPLY_RATIO),
+            "need_m3s": need_m3s,
             "plain_m3s": plain_m3s,
+            "strength": 1.0,
+            "drawn_ratio": 1.0,
             "speed": speed,
             "coil_c": coil_c,
             "supply_c": coil_c,
             "casing_c": state.casing_c,
         }
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
+        weighs = fleet.unit_sums(np.where(self._unit_state["strength"] != 1.0, 1.0, 0.0)) > 0
         of_dcs = {
+            "shares_due": weighs,
             "exceeds": exceeds & (fleet.oversupply_decay > 0),
             "fan_speed": state.following[fleet.unit_offsets[:-1]],
             "crac_m3s_per_rack": flow_m3s / np.diff(fleet.rack_offsets),
@@ -941,13 +952,14 @@ class Hall:
 
     def _hall_state(self, server_c: Any) -> HallState:
         """Return the thermal state after the last substep."""
+        drawn_ratio = self._tables.plenum.drawn_ratio * self._unit_state["drawn_ratio"]
         return HallState(
             server_c=server_c,
             mixed_c=self._places.values_of_racks(self._memory["mixed_c"][None])[0],
             exhaust_c=self._places.values_of_racks(self._exhaust()[None])[0],
             captured_m3s=self._places.values_of_racks(self._memory["captured_m3s"][None])[0],
-            need_m3s=self._unit_state["need_m3s"] / self._tables.plenum.drawn_ratio,
-            plain_m3s=self._unit_state["plain_m3s"] / self._tables.plenum.drawn_ratio,
+            need_m3s=self._unit_state["need_m3s"] / drawn_ratio,
+            plain_m3s=self._unit_state["plain_m3s"] / drawn_ratio,
             following=self._unit_state["following"].copy(),
             supply_excess_k=self._unit_state["excess_k"].copy(),
             casing_c=self._unit_state["casing_c"].copy(),

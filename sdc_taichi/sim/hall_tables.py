@@ -206,6 +206,8 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
     tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
     tables.rows("unit_inputs")["casing_m3"][:] = CASING_S * fleet.unit_design_m3s
     tables.rows("unit_state")["fitted_m3s"][:] = -1.0
+    for name in ("strength", "drawn_ratio"):
+        tables.rows("unit_state")[name][:] = 1.0
     tables.rows("unit_state")["return_offset_k"][:] = 0.0
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
