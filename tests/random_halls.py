@@ -66,6 +66,9 @@ def random_values(
     hall["height_zones"] = int(rng.integers(1, 8))
     hall["height_gradient"] = float(rng.uniform(0.0, 0.6))
     crac["units"] = int(rng.integers(1, 5))
+    # The twin has fixed shares and common return air; test_shared_plenum.py tests the others.
+    crac["plenum_coupling"] = hall["recirculation"]["oversupply_decay"] = 0.0
+    crac["return_air"] = "common"
     crac["supply_length_m"] = float(rng.uniform(2.0, 10.0))
     if rng.integers(3) == 0:
         shares = rng.dirichlet(np.ones(crac["units"]), racks)
@@ -261,7 +264,10 @@ def at_design(configs: Sequence[DataCenterConfig]) -> HallSums:
     setpoint_c = np.concatenate(
         [np.full(c.hvac.crac.units, c.hall.design_supply_c) for c in configs]
     )
-    return Hall(fleet_of(*configs), "f64").solve(Conditions(setpoint_c, np.ones(len(configs))))
+    fleet = fleet_of(*configs)
+    speed = fleet.design_speed[fleet.unit_dc]
+    conditions = Conditions(setpoint_c, np.ones(len(configs)), unit_low=speed, unit_high=speed)
+    return Hall(fleet, "f64").solve(conditions)
 
 
 def flat(config: DataCenterConfig) -> DataCenterConfig:

@@ -66,12 +66,13 @@ def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> N
     before = whole[-1].unit_flow_m3s / fleet.unit_design_m3s
     after = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
     np.testing.assert_allclose(before, before[0], rtol=2e-3)
-    np.testing.assert_allclose(after[1:], after[1], rtol=0.01)
+    # All others take over, those near it a little more than the rest.
+    np.testing.assert_allclose(after[1:], after[1], rtol=0.03)
     assert after[0] == pytest.approx(0.1)
     # The others give what is missing: of every rack's air, none falls short.
     total = lost[-1].crac_flow_m3s[0]
     assert total == pytest.approx(whole[-1].crac_flow_m3s[0], rel=0.03)
-    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.0
+    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.5
     assert all(result.throttled_racks[0] == 0 for result in lost)
 
 
@@ -135,7 +136,7 @@ def test_two_spare_units_take_over_for_two_that_are_lost() -> None:
     _, whole = run_at_full_load(*eight, *MINUTES, steps=2)
     fleet, lost = run_at_full_load(*eight, PROTECTED, *MINUTES, two, steps=60)
     runs = np.delete(lost[-1].unit_flow_m3s / fleet.unit_design_m3s, [0, 5])
-    np.testing.assert_allclose(runs, runs[0], rtol=0.01)
+    np.testing.assert_allclose(runs, runs[0], rtol=0.02)
     assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.5
     assert all(result.throttled_racks[0] == 0 for result in lost)
 
@@ -208,14 +209,14 @@ def coil_w(fleet: Fleet, result: StepResult) -> np.ndarray:
 
 def test_a_coil_takes_no_more_than_its_capacity_and_the_others_take_the_rest() -> None:
     limit_w = np.array([80e3, 140e3, 200e3, 300e3])
-    fleet, results = run_at_full_load(FOUR, *HEAT_UNITS["three coils at their limit"])
+    limits = ["hvac.crac.return_air=common", *HEAT_UNITS["three coils at their limit"]]
+    fleet, results = run_at_full_load(FOUR, *limits)
     taken_w = coil_w(fleet, results[0])
     np.testing.assert_allclose(taken_w[:3], limit_w[:3], rtol=1e-9)
     assert limit_w[2] < taken_w[3] < limit_w[3]
     assert results[0].unit_supply_c[3] == 18.0
     assert results[0].unmet_w[0] == 0.0
     # In the end a transient hall is the same.
-    limits = HEAT_UNITS["three coils at their limit"]
     _, slowly = run_at_full_load(FOUR, *MINUTES, *limits, steps=90)
     np.testing.assert_allclose(slowly[-1].unit_supply_c, results[0].unit_supply_c, atol=0.05)
 
@@ -229,7 +230,8 @@ def test_coils_that_are_too_small_leave_the_rest_to_the_room() -> None:
 
 
 def test_air_of_a_unit_that_is_down_passes_uncooled_to_the_racks_near_it() -> None:
-    _, results = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, LOST, steps=6)
+    common = "hvac.crac.return_air=common"
+    _, results = run_at_full_load(FOUR, N_PLUS_1, common, *MINUTES, LOST, steps=6)
     down = results[-1]
     assert down.unit_supply_c[0] == pytest.approx(down.return_c[0], abs=0.1)
     warmer = (down.rack_inlet_c - results[1].rack_inlet_c).reshape(4, 5)

@@ -337,12 +337,65 @@ def test_a_unit_passes_its_own_return_air_while_it_is_down_and_after_its_restart
         with Simulator(config, drivers=drivers, precision="f64") as sim:
             sim.reset(0)
             found[kind] = [(sim.step(), sim.state) for _ in range(12)]
-    for result, state in found["own"][3:6]:
+    # A step's supply air is a mean, which return air at its end agrees with once both are steady.
+    for result, state in found["own"][4:6]:
         assert result.unit_supply_c[0] == pytest.approx(state.return_air_c[0], abs=0.1)
         assert abs(result.unit_supply_c[0] - result.return_c[0]) > 0.3
-    for _, state in found["common"][3:6]:
+    for _, state in found["common"][4:6]:
         np.testing.assert_array_equal(state.return_air_c, state.return_air_c[0])
     np.testing.assert_allclose(found["own"][11][0].unit_supply_c, 23.0, atol=0.05)
+
+
+def test_a_unit_without_airflow_has_the_return_air_of_the_hall() -> None:
+    running = np.array([0.0, 1.0, 1.0, 1.0])
+    _, hall, sums = solved("corrected", running, OWN, load=0.9, running=running)
+    assert hall.sweeps[0] < 100
+    offset_k = hall._unit_state["return_offset_k"]
+    assert offset_k[0] == 0.0
+    assert 0.0 < np.abs(offset_k[1:]).max() < 10.0
+    assert hall._unit_state["supply_c"][0] == pytest.approx(sums.units_return_c[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("flow_model", ["follow_servers", "pressure", "controlled"])
+def test_a_saved_hall_goes_on_the_same_while_a_unit_is_down(flow_model: str) -> None:
+    event = "events.scheduled=[{kind: crac_down, unit: 1, start_h: 0.25, duration_h: 0.5}]"
+    config = load_config(
+        "corrected",
+        ["hvac.crac.units=4", f"hvac.crac.flow_model={flow_model}", event,
+         "simulation.thermal=transient"],
+    )  # fmt: skip
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 0.8)))
+    with Simulator(config, drivers=drivers) as sim, Simulator(config, drivers=drivers) as fresh:
+        sim.reset(0)
+        fresh.reset(0)
+        for _ in range(4):
+            fresh.load_state_dict(sim.state_dict())
+            expected, found = sim.step(), fresh.step()
+            for name in ("rack_inlet_c", "unit_flow_m3s", "unit_supply_c"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize(
+    ("preset", "overrides", "expected"),
+    [
+        ("corrected", ["hvac.crac.units=4"], (0.75, 4.0, True)),
+        ("corrected", [], (0.0, 0.0, False)),
+        ("hall_of_2026", ["hall.layout.returns=end_wall"], (0.75, 2.6, True)),
+        ("hall_of_2026", [*coupled(0.0), "hvac.crac.return_air=common"], (0.0, 0.0, False)),
+        ("corrected", [f"hvac.crac.unit_shares={[[0.5, 0.5]] * 20}", "hvac.crac.units=2"],
+         (0.0, 4.0, False)),
+        ("sustaindc", [], (0.0, 0.0, False)),
+        ("paper", [], (0.0, 0.0, False)),
+    ],
+)  # fmt: skip
+def test_halls_with_raised_floors_couple_their_units_by_default(
+    preset: str, overrides: list[str], expected: tuple[float, float, bool]
+) -> None:
+    fleet = build_fleet([load_config(preset, overrides)])
+    found = fleet.plenum_coupling[0], fleet.oversupply_decay[0], bool(fleet.own_return[0])
+    assert found == expected
+    # Without recirculation there is nothing on which oversupply and return air could act.
+    assert (fleet.air is None) == (preset in ("sustaindc", "paper"))
 
 
 def near_and_far(fleet: Fleet, unit: int) -> tuple[Any, Any]:

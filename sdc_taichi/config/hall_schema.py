@@ -52,6 +52,9 @@ reach full speed over about 10 K. With a difference of 1 K, the curves extrapola
 would give a hundred times the fan power."""
 LEAST_POINTS_APART_K = 0.1
 """Smallest difference of inlet temperature of two points of a server curve, in K."""
+OVERSUPPLY_DECAY = {"ceiling": 4.0, "end_wall": 2.6}
+"""Decay of the exhaust shares with oversupply by the position of the return air openings, fitted to
+halls that ``sdc-taichi hall solve`` computes with more supply air than servers draw."""
 RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
 """Number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
@@ -121,9 +124,11 @@ class RecirculationConfig(Section):
     layout; None uses the layout."""
     matrix_kind: Literal["R", "D"] | None = None
     """Kind of the matrix in a .csv file; None for .npz files, which contain the kind."""
-    oversupply_decay: Annotated[float, Field(ge=0, le=20)] = 0.0
+    oversupply_decay: Annotated[float, Field(ge=0, le=20)] | None = None
     """Decay of the exhaust shares with oversupply: supply air of a multiple 1 + x of the need of a
-    rack lowers its exhaust share by exp(-x times this value), 0..20; 0 leaves it unchanged."""
+    rack lowers its exhaust share by exp(-x times this value), 0..20; 0 leaves it unchanged. None
+    means what the layout solver gives, 4 with returns in the ceiling and 2.6 with returns in the
+    end walls, or 0 with one CRAC unit or a matrix file."""
     calibrate: Literal["rack", "row", "hall", "none"] | None = None
     """Approach temperatures to which recirculation is scaled: those of each ``rack``, or the means
     of each ``row`` or of the ``hall``, within which racks differ by the layout or the matrix file.

@@ -34,6 +34,9 @@ from sdc_taichi.types import F64
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 USUAL_AIR_J_PER_M3_K = 1.2e3
 """Volumetric heat capacity of air near sea level, in J/(m3 K); only checks use it."""
+USUAL_COUPLING = 0.75
+"""Coupling of CRAC units under a raised floor, between fixed shares and one pressure; an
+assumption."""
 MOST_CRAC_UNITS = 10_000
 """Largest number of CRAC units of a hall, more than the largest fan walls have fans."""
 UnitAirflow = Annotated[float, Field(ge=0.01, le=1000)]
@@ -127,14 +130,15 @@ class CracConfig(Section):
     row sums to 1; None computes shares from distances."""
     supply_length_m: LengthM = 6.0
     """Distance at which the weight of a unit in the supply of a rack falls to 1/e, in m."""
-    plenum_coupling: Share = 0.0
+    plenum_coupling: Share | None = None
     """Coupling of the units by the plenum under a raised floor, 0..1: with 1 it has one pressure,
     so that racks draw from each unit in proportion to its airflow; with 0 each unit keeps its
-    share in the supply of each rack while all units run."""
+    share in the supply of each rack while all units run. None means 0.75, or 0 with
+    ``unit_shares``."""
     return_air: Literal["own", "common"] | None = None
     """Return air of the units: ``own``, each draws the exhaust of the racks near it (weights as in
     ``supply_length_m``, from the exhaust faces), or ``common``, all draw the mean of the hall.
-    None means ``common``."""
+    None means ``own``, or ``common`` with ``unit_shares``."""
     capacity_kw: UnitCapacity | tuple[UnitCapacity, ...] | None = None
     """Largest heat that the coil of a unit removes, including the heat of its fan, in kW: one value
     for all units, or one per unit; None means that only the plant limits it."""
@@ -199,12 +203,16 @@ class CracConfig(Section):
     @property
     def coupling(self) -> float:
         """Coupling of the units by the plenum, 0..1; a single unit has none."""
-        return self.plenum_coupling if self.units > 1 else 0.0
+        if self.units == 1:
+            return 0.0
+        usual = USUAL_COUPLING if self.unit_shares is None else 0.0
+        return usual if self.plenum_coupling is None else self.plenum_coupling
 
     @property
     def draws_own_return(self) -> bool:
         """True if each unit draws its own return air; a single unit draws that of the hall."""
-        return self.units > 1 and self.return_air == "own"
+        usual = "own" if self.unit_shares is None else "common"
+        return self.units > 1 and (self.return_air or usual) == "own"
 
     @property
     def sized_by_need(self) -> bool:

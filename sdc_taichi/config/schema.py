@@ -30,6 +30,7 @@ from sdc_taichi.config.fields import (
 from sdc_taichi.config.hall_schema import (
     MOST_RACK_J_PER_K,
     MOST_RACK_U,
+    OVERSUPPLY_DECAY,
     ROOM_J_PER_K_W,
     SERVER_J_PER_K_W,
     HallConfig,
@@ -348,6 +349,16 @@ class DataCenterConfig(Section):
                 "the curve of fan_airflow_points or fan_airflow_ratio_lb, or set "
                 "fan_airflow_ratio_limits)"
             )
+
+    @property
+    def oversupply_decay(self) -> float:
+        """Decay of the exhaust shares with oversupply, see ``RecirculationConfig``."""
+        recirculation = self.hall.recirculation
+        if recirculation.oversupply_decay is not None:
+            return recirculation.oversupply_decay
+        if self.hvac.crac.units == 1 or recirculation.matrix_file is not None:
+            return 0.0
+        return OVERSUPPLY_DECAY[self.hall.layout.returns]
 
     @property
     def server_heat_capacity_kj_per_k(self) -> float:

@@ -332,7 +332,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         unit_capacity_w=np.concatenate([_capacity_w(config) for config in listed]),
         setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
         plenum_coupling=np.array([c.hvac.crac.coupling for c in listed]),
-        oversupply_decay=np.array([c.hall.recirculation.oversupply_decay for c in listed]),
+        oversupply_decay=np.array([c.oversupply_decay for c in listed]),
         own_return=np.array(
             [c.hvac.crac.draws_own_return and models["inlet"] == "recirculation" for c in listed]
         ),
