@@ -73,6 +73,9 @@ centrifugal compressor. Without a smallest lift, the COP of a constant Carnot ef
 diverge as the two temperatures become equal.
 """
 
+ELECTRIC_DELTA = (29.44, 2.682759, 6.667)
+"""Condenser water at the reference point of ``electric_water_cooled`` in C, its change divided by
+the change of the chilled water at constant capacity, and chilled water at that point in C."""
 MIN_DELTA_K = -15.0
 """Smallest temperature difference at which Chiller:Electric is evaluated, in K. Its capacity is a
 parabola with a maximum near this value; below it, colder condenser water would reduce capacity."""
@@ -153,8 +156,10 @@ class ChillerModel:
 
     equations: Callable[[Values, ChillerPoint], ChillerResult]
     """Function from a cooling load in W, (B,), and a point within the bounds to power and heat."""
-    least_lift: bool = False
-    """True if the power no longer falls below the smallest lift, ``min_lift_k``."""
+    least_useful_c: Callable[[Values, ChillerParameters], Values] | None = None
+    """Function from leaving chilled-water temperature, in C, (B,), and parameters to the entering
+    condenser-water temperature below which colder condenser water no longer saves power, in C,
+    (B,); None if there is no such temperature."""
     tower_water: bool = True
     """True if the water of a cooling tower can cool the condenser."""
     outdoor_air: bool = False
@@ -264,7 +269,10 @@ def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
     The coefficients are those of the EnergyPlus unit test ChillerElectric, whose nominal COP is
     4.75.
     """
-    delta_k = (point.condenser_c - 29.44) / 2.682759 - (point.chilled_water_c - 6.667)
+    condenser_c, per_chilled_k, chilled_water_c = ELECTRIC_DELTA
+    delta_k = (point.condenser_c - condenser_c) / per_chilled_k - (
+        point.chilled_water_c - chilled_water_c
+    )
     return _electric(
         load_w,
         reference_w=point.reference_w,
@@ -372,15 +380,30 @@ def paper(load_w: Values, point: ChillerPoint) -> ChillerResult:
     return _chiller(load, load, np.maximum(point.reference_w, load), power_w, rejected_w=power_w)
 
 
+def _at_least_lift(chilled_water_c: Values, machine: ChillerParameters) -> Values:
+    """Return the condenser water at the smallest lift, in C, (B,)."""
+    return chilled_water_c + machine.min_lift_k
+
+
+def _at_least_delta(chilled_water_c: Values, machine: ChillerParameters) -> Values:
+    """Return the condenser water at ``MIN_DELTA_K`` of ``electric_water_cooled``, in C, (B,)."""
+    condenser_c, per_chilled_k, reference_c = ELECTRIC_DELTA
+    return condenser_c + per_chilled_k * (chilled_water_c - reference_c + MIN_DELTA_K)
+
+
 CHILLERS: dict[str, ChillerModel] = {
     "centrifugal_vsd": ChillerModel(
-        centrifugal_vsd, least_lift=True, chilled_water_bounds_c=(4.0, 20.0)
+        centrifugal_vsd, least_useful_c=_at_least_lift, chilled_water_bounds_c=(4.0, 20.0)
     ),
-    "carnot": ChillerModel(carnot, least_lift=True, chilled_water_bounds_c=(4.0, 20.0)),
+    "carnot": ChillerModel(
+        carnot, least_useful_c=_at_least_lift, chilled_water_bounds_c=(4.0, 20.0)
+    ),
     "eir_york": ChillerModel(
         eir_york, chilled_water_bounds_c=(4.44, 8.89), condenser_bounds_c=(12.78, 35.0)
     ),
-    "electric_water_cooled": ChillerModel(electric_water_cooled, reference_cop=4.75),
+    "electric_water_cooled": ChillerModel(
+        electric_water_cooled, least_useful_c=_at_least_delta, reference_cop=4.75
+    ),
     "electric_air_cooled": ChillerModel(
         electric_air_cooled, tower_water=False, outdoor_air=True, reference_cop=3.0
     ),

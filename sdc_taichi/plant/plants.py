@@ -214,13 +214,26 @@ class _TowerLoop:
                 heat_w, self._tower_point(heat_w, alone_c), (np.maximum(by_lift, 0.0), by_share)
             )
             if self.devices.reset:
-                least_c = np.maximum(design.min_condenser_c, self.chilled_c + design.useful_lift_k)
-                most_c = np.maximum(nearest_c, design.design_condenser_c)
+                least_c = self._least_c()
+                most_c = design.design_condenser_c
                 alone_c = np.maximum(np.minimum(best_alone_c, most_c), least_c)
                 precooled_c = np.maximum(np.minimum(best_precooled_c, most_c), useful_c)
                 alone_c = self._capable_c(self.taken_w, alone_c, np.maximum(full_c, least_c))
             alone_c, precooled_c = np.maximum(alone_c, full_c), np.maximum(precooled_c, full_c)
         return alone_c, precooled_c
+
+    def _least_c(self) -> F64:
+        """Return the coldest condenser water that saves power of the chiller, in C, (B,).
+
+        A chiller whose capacity is short in such cold water needs warmer water.
+        """
+        design, model = self.design, self.devices.chiller
+        least_c = design.min_condenser_c
+        if model.least_useful_c is not None:
+            least_c = np.maximum(least_c, model.least_useful_c(self.chilled_c, design.machine))
+        return self._capable_c(
+            self.taken_w, least_c, np.maximum(least_c, design.fullest_condenser_c)
+        )
 
     def at(self, setpoint_c: F64) -> _Operation:
         """Operate tower, economiser and chiller at a setpoint of the tower water, in C, (B,).

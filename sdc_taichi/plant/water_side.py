@@ -78,9 +78,6 @@ class WaterSideDesign:
     """Highest condenser-water temperature that the chiller allows, in C, (B,)."""
     design_condenser_c: F64
     """Condenser-water temperature at the design point, in C, (B,)."""
-    useful_lift_k: F64
-    """Condenser-water temperature minus chilled-water temperature below which colder condenser
-    water no longer reduces the power of the chiller, in K, (B,)."""
     hot_evaporator_share: F64
     """Heat taken from the chilled water divided by the heat of the condenser, with condenser water
     at ``max_condenser_c``, (B,)."""

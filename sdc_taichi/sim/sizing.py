@@ -446,7 +446,6 @@ def _condenser_slopes(fleet: Fleet, outdoor_c: F64, wet_bulb_c: F64) -> dict[str
     )
     return {
         "design_condenser_c": design_c,
-        "useful_lift_k": np.asarray(machine.min_lift_k * model.least_lift),
         "hot_evaporator_share": high / (high + power(high, hottest_c)),
         "idle_w_per_w_k": at_low - low * by_load,
         "load_w_per_w_k": by_load,
