@@ -30,6 +30,7 @@ from sdc_taichi.cli.terminal import (
     ProgressLines,
     count_text,
     duration,
+    exit_on_interrupt,
     stage_bars,
     wide_console,
 )
@@ -329,17 +330,18 @@ def place_command(
 
     CRAC units, plant and floor stay those of the hall as it is.
     """
-    from sdc_taichi.run.rack_places import place_values, study_places
-
     check_out_file(out, ".png", force=force)
-    study = study_places(
-        config.read()[0],
-        rack_type,
-        count,
-        replaced=replace or (),
-        keep=keep,
-        inlet_limit_c=limit,
-    )
+    with exit_on_interrupt():
+        from sdc_taichi.run.rack_places import place_values, study_places
+
+        study = study_places(
+            config.read()[0],
+            rack_type,
+            count,
+            replaced=replace or (),
+            keep=keep,
+            inlet_limit_c=limit,
+        )
     if out is not None:
         from sdc_taichi.viz.floor_plan_figure import places_figure
         from sdc_taichi.viz.plotting import save_picture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import signal
 import sys
 import time
@@ -187,6 +188,29 @@ def interruptible() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def exit_on_interrupt() -> Iterator[None]:
+    """End the process at Ctrl-C with a message, during work that leaves no files or processes.
+
+    A ``KeyboardInterrupt`` may be lost while modules are imported and kernels are compiled.
+    """
+
+    def handle(*_: object) -> None:
+        # Python may be writing to sys.stderr itself.
+        os.write(2, b"interrupted; nothing written\n")
+        os._exit(EXIT_INTERRUPTED)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler:  # Ctrl-C is ignored, or ends the process already
+        yield
+        return
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

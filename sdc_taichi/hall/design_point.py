@@ -134,10 +134,10 @@ def design_point_at(
         ConfigError: The approach temperatures leave no positive temperature rise for the servers.
     """
     supply_c, air_j_per_m3_k = config.hall.design_supply_c, servers.air.j_per_m3_k
+    server_w, moved = _at_full_load(config, servers, inlet_c)
     if full_airflow_m3s is None:
         rack_k = config.hall.rack_approach_k() if approach_k is None else approach_k
-        full_airflow_m3s = _full_airflow_m3s(config, servers, inlet_c, rack_k)
-    server_w, moved = _at_full_load(config, servers, inlet_c)
+        full_airflow_m3s = _full_airflow_m3s(config, servers, server_w, moved, rack_k)
     it_w = servers.per_rack(servers.count * server_w)
     largest_m3s = float(full_airflow_m3s.max())
     server_rise_k = server_w / (air_j_per_m3_k * full_airflow_m3s * moved)
@@ -194,8 +194,9 @@ def _height_factor(
     within = _EXACT_FACTOR if config.hall.racks <= EXACT_RACKS else _LARGE_FACTOR
     for _ in range(_MOST_HEIGHT_ITERATIONS):
         inlet_c = _inlet_c(servers, supply_c, group_approach_k, factor)
-        full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
-        airflow = servers.count * full_m3s * _at_full_load(config, servers, inlet_c)[1]
+        server_w, moved = _at_full_load(config, servers, inlet_c)
+        full_m3s = _full_airflow_m3s(config, servers, server_w, moved, approach_k)
+        airflow = servers.count * full_m3s * moved
         mean = servers.per_rack(airflow * servers.height_factor) / servers.per_rack(airflow)
         previous, factor = factor, servers.height_factor / servers.per_group(mean)
         if np.max(np.abs(factor - previous)) < within:
@@ -204,18 +205,24 @@ def _height_factor(
 
 
 def _full_airflow_m3s(
-    config: DataCenterConfig, servers: RackServers, inlet_c: F64, approach_k: F64
+    config: DataCenterConfig, servers: RackServers, server_w: F64, moved: F64, approach_k: F64
 ) -> F64:
     """Return the airflow of one server of each group at an airflow ratio of 1, in m3/s, (G,).
 
     The airflow is configured or follows from the design rise of the group. Servers with neither
     have an airflow proportional to their power. The factor is such that the mean temperature rise
     of their racks and the approach temperatures satisfy the heat balance of the hall.
+
+    Args:
+        config: The data center.
+        servers: Servers of the hall.
+        server_w: Power of one server of each group, from ``_at_full_load``, W, (G,).
+        moved: Relative airflow of one server of each group, from ``_at_full_load``, (G,).
+        approach_k: Inlet minus supply temperature of each rack, K, (R,).
     """
     full_m3s = servers.full_airflow_m3s
     if not np.isnan(full_m3s).any():
         return full_m3s
-    server_w, moved = _at_full_load(config, servers, inlet_c)
     per_rise_m3s = server_w / (servers.air.j_per_m3_k * moved)
     full_m3s = np.where(np.isnan(full_m3s), per_rise_m3s / servers.design_rise_k, full_m3s)
     open_count = servers.count * np.isnan(full_m3s)

@@ -30,6 +30,9 @@ rows form one run."""
 MOST_WEIGHTS = 2**27
 """Largest number of weights, or of runs, of a hall; this many weights take 1 GB in f64."""
 
+_MOST_COPIED_WEIGHTS = 2**22
+"""Largest number of weights of all runs that are copied to sum them faster; they take 34 MB."""
+
 
 @dataclass(frozen=True)
 class MixWeights:
@@ -65,21 +68,34 @@ class MixWeights:
             return out * self.norm
         of_run = np.zeros(len(self.run_length))
         windows = {n: sliding_window_view(strong, n) for n in np.unique(self.run_length) if n}
-        for runs in self._equal_runs:
-            length, at = self.run_length[runs[0]], self.run_first_weight[runs[0]]
-            sources = windows[length][self.run_first_rack[runs]]
-            # einsum adds in an order that does not depend on the number of threads.
-            of_run[runs] = np.einsum("ij,j->i", sources, self.weights[at : at + length])
+        for runs, first_rack, weights in self._run_batches:
+            sources = windows[weights.shape[-1]][first_rack]
+            # einsum adds in an order that does not depend on the number of threads or of runs.
+            of_run[runs] = np.einsum("ij,ij->i", sources, weights)
         rack = np.repeat(np.arange(len(out)), np.diff(self.run_offsets))
         return np.asarray(np.bincount(rack, of_run, len(out)) * self.norm)
 
     @cached_property
-    def _equal_runs(self) -> list[I64]:
-        """Indices of the runs that share their weights, for each distinct run of weights."""
-        key = self.run_first_weight * (np.int64(1) + self.run_length.max()) + self.run_length
+    def _run_batches(self) -> list[tuple[I64, I32, F64]]:
+        """Runs that are summed together, as their indices, first racks and weights.
+
+        Runs of large halls are summed together if they share their weights, (1, length). In halls
+        whose copied weights, (runs, length), fit into memory, all runs of equal length are.
+        """
+        key = self.run_length.astype(np.int64)
+        copies = int(key.sum()) <= _MOST_COPIED_WEIGHTS
+        if not copies:
+            key += self.run_first_weight * (np.int64(1) + self.run_length.max())
         order = np.argsort(key, kind="stable")
-        runs = np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
-        return [of_key for of_key in runs if self.run_length[of_key[0]]]
+        batches = []
+        for runs in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+            length = int(self.run_length[runs[0]])
+            if length:
+                first = self.run_first_weight[runs]
+                every = sliding_window_view(self.weights, length)
+                weights = every[first if copies else first[:1]]
+                batches.append((runs, self.run_first_rack[runs], weights))
+        return batches
 
     def apply_transposed(self, values: F64) -> F64:
         """Return the product of the transposed weights and rack values, (R,)."""

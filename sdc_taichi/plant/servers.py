@@ -9,8 +9,8 @@ Buildings 231; EnergyPlus Engineering Reference, ElectricEquipment:ITE:AirCooled
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -142,8 +142,9 @@ def linear_curve(
     return slope, offset, ratio_at_coolest[1] - ratio_at_coolest[0]
 
 
+@lru_cache(maxsize=64)
 def curve_through(
-    points: Sequence[tuple[float, float, float]], curve_limit_c: float
+    points: tuple[tuple[float, float, float], ...], curve_limit_c: float
 ) -> tuple[float, float, tuple[Knee, ...]]:
     """Return offset, load shift and knees of the curve through points, whose slope is otherwise 0.
 

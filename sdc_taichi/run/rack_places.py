@@ -18,9 +18,10 @@ from sdc_taichi.config import DataCenterConfig, with_values
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c, rank
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
+from sdc_taichi.sim.drivers import load_drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
-from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.sizing import size
 from sdc_taichi.types import F64
 
 Kept = Literal["n", "n+1"]
@@ -141,7 +142,10 @@ def study_places(
         )
     limit_c = allowable_c(config.protection.ashrae_class)[1]
     limit_c = limit_c if inlet_limit_c is None else inlet_limit_c
-    base = _solve(base_fleet, Hall(base_fleet, "f64", samples=False), np.ones(base_fleet.units))
+    # Solved on several threads as the candidates are, the hall shares their compiled kernel.
+    base_solver = Hall(base_fleet, "f64", samples=False, serial_groups=0)
+    base = _solve(base_fleet, base_solver, np.ones(base_fleet.units))
+    limits = _limits(base_fleet, base_solver)
     fixed = _fixed_hall(config, base_fleet, float(base.it_kw[0]) / hall.racks)
     grid = is_open.reshape(hall.rows, hall.racks_per_row)
     positions = _candidates(grid, count, base.rack_inlet_c[0])
@@ -153,10 +157,9 @@ def study_places(
         positions = [positions[i] for i in chosen]
     configs = [_with_racks(fixed, types, racks, type_name, i) for i, racks in enumerate(positions)]
     fleet = build_fleet(configs)
-    solver = Hall(fleet, "f64", samples=False)
+    solver = Hall(fleet, "f64", samples=False, serial_groups=0)
     solved = _solve(fleet, solver, np.ones(fleet.units))
     airflow_share = _needed_airflow_share(fleet, solver)
-    limits = _limits(config)
     lost_c = np.full(len(configs), np.nan)
     lost_short, lost_airflow = np.zeros(len(configs)), np.zeros(len(configs))
     if keep == "n+1":
@@ -292,24 +295,26 @@ class _Limits:
         return out
 
 
-def _limits(config: DataCenterConfig) -> _Limits:
-    """Return what plant, coils, UPS and grid connection of a hall can do, as it is sized."""
-    with Simulator(config) as sim:
-        sim.reset()
-        sizing, fleet = sim.sizing, sim.fleet
-        plant_kw = float(sizing.water_side.cooling_w[0]) / 1e3
-        unit_kw = np.where(np.isfinite(fleet.unit_capacity_w), fleet.unit_capacity_w / 1e3, np.inf)
-        grid_kw = float(sizing.grid_limit_kw[0])
-        per_it = float(sizing.facility_w[0] / sizing.it_w[0])
-        ups_w = np.broadcast_to(sizing.power_path.ups.rated_w, 1)[0]
-        loss_w = sizing.power_path.distribution.loss_w(sizing.it_w)
-        ups_kw = float(ups_w - np.broadcast_to(loss_w, 1)[0]) / 1e3
+def _limits(fleet: Fleet, solver: Hall) -> _Limits:
+    """Return what plant, coils, UPS and grid connection of a hall can do, as it is sized.
+
+    Args:
+        fleet: The hall.
+        solver: Its solver.
+    """
+    inputs = load_drivers(fleet.configs)
+    sizing = size(fleet, solver, inputs.design_outdoor_c, inputs.design_wet_bulb_c)
+    plant_kw = float(sizing.water_side.cooling_w[0]) / 1e3
+    unit_kw = np.where(np.isfinite(fleet.unit_capacity_w), fleet.unit_capacity_w / 1e3, np.inf)
+    grid_kw = float(sizing.grid_limit_kw[0])
+    ups_w = np.broadcast_to(sizing.power_path.ups.rated_w, 1)[0]
+    loss_w = sizing.power_path.distribution.loss_w(sizing.it_w)
     return _Limits(
         min(plant_kw, float(unit_kw.sum())),
         unit_kw,
         np.inf if grid_kw >= NO_LIMIT_KW else grid_kw,
-        ups_kw,
-        per_it,
+        float(ups_w - np.broadcast_to(loss_w, 1)[0]) / 1e3,
+        float(sizing.facility_w[0] / sizing.it_w[0]),
     )
 
 

@@ -259,9 +259,18 @@ class Hall:
         precision: Precision of the temperatures and powers of servers and racks.
         samples: True if large halls start from sampled racks. False saves the preparation if few
             steps are solved.
+        serial_groups: Problem size up to which kernels run on one thread, see ``SERIAL_GROUPS``.
+            Solvers on one thread and on several do not share a compiled kernel.
     """
 
-    def __init__(self, fleet: Fleet, precision: Precision, *, samples: bool = True) -> None:
+    def __init__(
+        self,
+        fleet: Fleet,
+        precision: Precision,
+        *,
+        samples: bool = True,
+        serial_groups: int = SERIAL_GROUPS,
+    ) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import hall, layers
         from sdc_taichi.kernels.compiler.named_kernel import NamedKernel
@@ -334,8 +343,7 @@ class Hall:
         self._weighs_apart = len(tasks) > fleet.size and bool(np.any(fleet.plenum_coupling > 0))
         """True if a call of its own weighs the CRAC units of data centers that are split."""
         self._sparse_dcs = sparse_halls(fleet)
-        self._serial_groups = SERIAL_GROUPS
-        """Problem size up to which kernels run on one thread, see ``SERIAL_GROUPS``."""
+        self._serial_groups = serial_groups
         self._sample: Hall | None = None
         """Sampled racks of the data centers ``_sparse_dcs``; None if there are none."""
         if samples and len(self._sparse_dcs):
@@ -824,12 +832,12 @@ class Hall:
         self._sparse_dcs = self._sparse_dcs[np.isin(entries, [*modes])]
         if not modes:
             return
-        sample = Hall(sampled_fleet(fleet, self._sparse_dcs, modes), precision)
+        # A hall that runs on several threads and its sampled racks, which would run on one, share
+        # one compiled kernel, which shortens the start.
+        is_serial = tables.group_places * LANES <= SERIAL_GROUPS
+        sampled_racks = sampled_fleet(fleet, self._sparse_dcs, modes)
+        sample = Hall(sampled_racks, precision, serial_groups=SERIAL_GROUPS if is_serial else 0)
         sample._step_kernel.bind(tolerance_k=SAMPLE_TOLERANCE_K[precision])
-        if tables.group_places * LANES > SERIAL_GROUPS:
-            # A hall that runs on several threads and its sampled racks, which would run on one,
-            # then share one compiled kernel, which shortens the start.
-            sample._serial_groups = 0
         array, rows = build_steady_states(fleet, self._places, self._dtype, modes)
         dc_ints = tables.rows("dc_ints")
         for name, values in rows.items():
