@@ -23,7 +23,7 @@ COOL_HALL_C = np.linspace(22.0, 24.0, 1000)
 
 
 def scale_of(inlet_c: np.ndarray = COOL_HALL_C, inlet_range: InletRange = None) -> ColourScale:
-    return inlet_scale(inlet_range, inlet_c, (35.0, 35.0), "A2")
+    return inlet_scale(inlet_range, inlet_c, (35.0, 35.0))
 
 
 def rgb(scale: ColourScale, *values: float) -> np.ndarray:

@@ -367,6 +367,8 @@ def test_maps_mark_units_that_are_down(run: Run) -> None:
     entity = run.recorded[f"/dc/{FOCUS[0]}/map/down"]
     marks = dict(zip(entity["step"], entity["Points2D:labels"], strict=True))
     assert marks == {12: ["CRAC 0 down"], 20: [], 24: ["CRAC 0 down", "CRAC 1 down"], 32: []}
+    boxes = run.recorded[f"/dc/{FOCUS[0]}/hall/down"]
+    assert dict(zip(boxes["step"], boxes["Boxes3D:labels"], strict=True)) == marks
     texts_of_units = run.recorded[f"/dc/{FOCUS[0]}/map/down_text"]
     shown = dict(zip(texts_of_units["step"], texts_of_units["Points2D:labels"], strict=True))
     assert shown == {12: ["CRAC 0 down"], 20: [], 24: ["CRAC 0, 1 down"], 32: []}
@@ -461,7 +463,7 @@ def test_log_tells_begin_and_end_of_everything_with_its_place(run: Run) -> None:
     for field, limit, begins, ends in (
         ("inlet_max_c", 27.0, "inlet above recommended 27 C", "within recommended 27 C"),
         ("inlet_max_c", 32.0, "inlet above allowable 32 C", "within allowable 32 C"),
-        ("unmet_w", 1.0, "plant at its limit", "plant below its limit"),
+        ("unmet_w", 100.0, "plant at its limit", "plant below its limit"),
         ("lost_tasks", 1e-6, "work lost:", "no work lost"),
         ("dropped_tasks", 1e-6, "work dropped:", "no work dropped"),
         ("overdue_tasks", 1e-6, "work overdue:", "no work overdue"),
@@ -533,8 +535,9 @@ def test_recording_explains_itself(run: Run) -> None:
     ):
         legend = run.recorded[f"/dc/{FOCUS[0]}/legend/{what}/ticks"]
         assert mark in legend["Points2D:labels"][0]
-    (limits,) = run.recorded[f"/dc/{FOCUS[0]}/legend/inlet/limits"]["Points2D:labels"]
-    assert limits[-2:] == ["recommended to 27", "allowable to (A1) 32"]
+    (limits,) = run.recorded[f"/dc/{FOCUS[0]}/legend/inlet/limit_names"]["Points2D:labels"]
+    assert limits[-2:] == ["27", "allowable to 32"]
+    assert "limits of inlets: those of ASHRAE class A1" in text
     (blueprint,) = RrdReader(run.path).blueprints()
     chunks = RrdReader(run.path).stream(store=blueprint).to_chunks()
     shown = str([chunk.to_record_batch().to_pydict() for chunk in chunks])

@@ -235,7 +235,7 @@ def check_inlet_range(inlet_range: object, place: str = "inlet_range") -> InletR
 
 
 def inlet_scale(
-    inlet_range: InletRange, inlet_c: Reals, limits_c: tuple[float, float], class_name: str
+    inlet_range: InletRange, inlet_c: Reals, limits_c: tuple[float, float]
 ) -> ColourScale:
     """Return the colour scale of inlets, whose colours change at the limits of a server class.
 
@@ -248,7 +248,6 @@ def inlet_scale(
         inlet_c: inlets at the beginning of the run, in C, any shape.
         limits_c: highest allowable inlet of the class of this data center and of all data centers
             in the recording, in C.
-        class_name: name of the class of this data center.
     """
     allowable_c, highest_limit_c = limits_c
     if inlet_range is None:
@@ -267,7 +266,7 @@ def inlet_scale(
     marks = [
         (RECOMMENDED_C[0], "recommended from"),
         (RECOMMENDED_C[1], "recommended to"),
-        (allowable_c, f"allowable to ({class_name})"),
+        (allowable_c, "allowable to"),
     ]
     return make_scale(low, high, "C", bands, marks=marks)
 

@@ -53,6 +53,8 @@ UNIT_COLOURS = tuple(colour for colour in PALETTE if colour != RED)
 """Colours of CRAC units in turn, as 0xRRGGBBAA; red marks units that are down."""
 MAX_UNIT_LABELS = 8
 """Largest number of labels of CRAC units at a wall; more would cover each other."""
+_DOWN_COLOUR = 0xFF3C3CFF
+"""Colour of units that are down, as ``DOWN_RGB`` on the heat maps."""
 NO_UNIT = 0
 """Class of racks that no CRAC unit supplies, in the share map."""
 _GREY_RGB = np.array([110.0, 110.0, 110.0])
@@ -361,7 +363,7 @@ class AirflowPictures:
             name = f"CRAC {unit}" if unit // 2 % every == 0 else ""
             mark = UNIT_COLOURS[unit % len(UNIT_COLOURS)], _UNIT_RADIUS, name
             is_down = unit in down or None in down
-            marks.append((RED, _DOWN_RADIUS, f"CRAC {unit} down") if is_down else mark)
+            marks.append((_DOWN_COLOUR, _DOWN_RADIUS, f"CRAC {unit} down") if is_down else mark)
         return marks
 
     def take(self, scales: Mapping[str, ColourScale]) -> Iterator[Columns]:
@@ -429,7 +431,7 @@ def sources_markdown(parts: Sequence[InletParts], per_row: int) -> str:
         per_row: number of racks in a row of the hall.
     """
     lines = [
-        "| rack | inlet, C | supply air, C | exhaust of the rack itself, K | exhaust of rack: K |",
+        "| rack | inlet, C | supply, C | own exhaust, K | exhaust of other racks, K |",
         "|---|---:|---:|---:|---|",
     ]
     for part in parts:

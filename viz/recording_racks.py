@@ -28,7 +28,7 @@ TRENDS = {"inlet_c": "hottest inlet of racks [C]", "outlet_c": "outlet of racks 
 """Titles of the trends of racks, keyed by entity, which is a field of ``RackValues``."""
 MAX_ROW_TIMES = 1_000
 """Largest number of times in the picture of the hottest row."""
-ROW_ASPECT = 3.0
+ROW_ASPECT = 2.2
 """Width of the picture of the hottest row, as a multiple of its height."""
 MARK_RGB = (60, 255, 90)
 """Colour of the mark of the hottest rack, which no palette of the maps contains."""
@@ -138,7 +138,7 @@ def mark_entities(path: str, hall: HallConfig, units: int, grid: TileGrid) -> En
     )
     yield f"{path}/crac", points
     down = rr.Points2D.from_fields(
-        radii=rr.Radius.ui_points(7.0), colors=DOWN_RGB, show_labels=False
+        radii=rr.Radius.ui_points(7.0), colors=DOWN_RGB, show_labels=False, draw_order=40.0
     )
     yield f"{path}/down", down
 
@@ -151,6 +151,38 @@ def unit_pixels(hall: HallConfig, units: int, grid: TileGrid) -> F64:
     beside = 0.03 * max(height, width)
     x = np.where(places_m[:, 0] > plan.length_m / 2, width + beside, -beside)
     return np.stack([x, places_m[:, 1] / plan.width_m * height], axis=1)
+
+
+def unit_centres_m(hall: HallConfig, units: int) -> F64:
+    """Return the centres of the CRAC units in the 3D hall, outside its end walls, in m, (U, 3)."""
+    plan = floor_plan(hall)
+    places_m = unit_places_m(plan, units)
+    x = places_m[:, 0] + np.where(places_m[:, 0] > plan.length_m / 2, 0.5, -0.5)
+    return np.stack([x, places_m[:, 1], np.full(units, hall.layout.rack_height_m / 2)], axis=1)
+
+
+def unit_half_size_m(hall: HallConfig) -> tuple[float, float, float]:
+    """Return half of the size of a CRAC unit in the 3D hall, in m."""
+    return 0.4, 0.6, hall.layout.rack_height_m / 2
+
+
+def down_boxes(down: Sequence[Sequence[int]], hall: HallConfig, units: int) -> Any:
+    """Return the CRAC units that are down in the 3D hall, at each time at which they change.
+
+    Args:
+        down: units that are down at each time.
+        hall: the hall.
+        units: number of CRAC units.
+    """
+    names = [unit for at_time in down for unit in at_time]
+    # Slightly larger than the units, which they hide.
+    half_size_m = 1.1 * np.array(unit_half_size_m(hall))
+    columns = rr.Boxes3D.columns(
+        centers=unit_centres_m(hall, units)[names].reshape(-1, 3),
+        half_sizes=np.tile(half_size_m, (len(names), 1)),
+        labels=[f"CRAC {unit} down" for unit in names],
+    )
+    return columns.partition([len(at_time) for at_time in down])
 
 
 def down_columns(down: Sequence[Sequence[int]], places: F64) -> Any:
@@ -234,7 +266,7 @@ class HottestRow:
         name = rack_place(int(self._racks[place]), per_row)
         hottest_c = float(self._values.inlet_c[at, place])
         mark = rr.Points2D(
-            [self._pixel(int(at), int(place)), (width / 2, -0.25 * height)],
+            [self._pixel(int(at), int(place)), (width / 2, -0.4 * height)],
             radii=[-5.0, -0.5],  # negative: points of the screen
             colors=[MARK_RGB, MARK_TEXT_RGB],
             labels=["", f"hottest: {name}, {hottest_c:.1f} C, {clock[int(at)]}"],
@@ -260,10 +292,11 @@ class HottestRow:
         )
         # The first and the last time may be at the same day, of which the time of day suffices.
         part = slice(6, None) if columns[0][:5] == columns[-1][:5] else slice(0, 5)
-        below = [((tick + 0.5) * self._across, 1.1 * height) for tick in ticks.tolist()]
+        below = [((tick + 0.5) * self._across, 1.05 * height) for tick in ticks.tolist()]
         last = self._hall.racks_per_row - 1
         places = sorted({0, last // 2, last})
-        beside = [(-6.0, (place + 0.5) * self._down) for place in places]
+        # The viewer draws labels below their points, in the same size for every picture.
+        beside = [(-0.27 * width, (place + 0.5) * self._down - 0.1 * height) for place in places]
         names = [f"rack {self._racks[place]}" for place in places]
         names[0] = rack_place(int(self._racks[0]), self._hall.racks_per_row)
         return rr.Points2D(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, USUAL_CLASS, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
 from sdc_taichi.run.failover import DEVICES
 from sdc_taichi.sim.events import ActiveEvent
@@ -86,7 +86,7 @@ class _Condition(NamedTuple):
 CONDITIONS = (
     _Condition(
         "unmet_w",
-        1.0,
+        100.0,
         "WARN",
         "cooling plant at its limit, heat stays in the room",
         "cooling plant below its limit again",
@@ -199,7 +199,8 @@ class ConditionLog:
                     if condition.is_summed
                     else f"{condition.value_text(ongoing.most)} at the most"
                 )
-                text = f"{condition.end}, {amount} (after {hours:g} h)"
+                time = f"{hours:g} h" if hours >= 1.0 else f"{60.0 * hours:.0f} min"
+                text = f"{condition.end}, {amount} (after {time})"
                 yield LogEntry(step, self._dc, "INFO", text)
                 del self._ongoing[index]
 
@@ -409,6 +410,7 @@ def _data_center_lines(
     location = description.get("location", config.site.location)
     provenance: Mapping[str, str] = description.get("provenance", {})
     hashes: Mapping[str, str] = description.get("sha256", {})
+    server_class = config.protection.ashrae_class or USUAL_CLASS
     return [
         f"## {name}",
         config.description,
@@ -416,6 +418,7 @@ def _data_center_lines(
         f"- site {location}, from {config.site.start}",
         f"- hall of {_count_text(config.hall.rows, 'row')} with "
         f"{_count_text(config.hall.racks_per_row, 'rack')} each, {_count_text(servers, 'server')}",
+        f"- limits of inlets: those of ASHRAE class {server_class}",
         *(f"- {kind}: {source}" for kind, source in provenance.items()),
         *(f"- SHA-256 of the {kind} file: `{value}`" for kind, value in hashes.items()),
     ]

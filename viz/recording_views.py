@@ -9,16 +9,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
+from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.sim.fleet import Fleet
 
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, annotation_context, invisible_names
-from .recording_racks import TRENDS, mark_entities
+from .recording_racks import (
+    DOWN_RGB,
+    TRENDS,
+    mark_entities,
+    unit_centres_m,
+    unit_half_size_m,
+)
 from .recording_series import (
     COMMAND_STATES,
     FLEET_PLOTS,
@@ -51,6 +58,10 @@ MAX_ROW_LABELS = 5
 _MAP_BACKGROUND = (20, 20, 20)
 """Background of maps in all themes, which no colour of a rack matches."""
 _LABEL_RGB = (135, 135, 135)  # a grey that is legible on dark and on light backgrounds
+_LIMIT_LABEL_EDGE, _LIMIT_LABELS_APART = 25, 90
+"""Smallest distance of the middle of a label of a limit from the ends of the colour bar, and from
+that of the next label, in pixels of the bar. At these, no edge of the view cuts a label, and labels
+do not cover each other."""
 
 Entities = Iterator[tuple[str, Any]]
 """Iterator of entity paths, each with the static component or archetype of the entity."""
@@ -245,7 +256,7 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
     bar = rrb.Spatial2DView(
         origin=f"{tab.path}/legend/{quantity}",
         name=f"colours of {MAP_TITLES[quantity]} [{scale.unit}]",
-        visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-14, 24)),
+        visual_bounds=rrb.VisualBounds2D(x_range=(-34, 274), y_range=(-26, 32)),
     )
     name = MAP_TITLES[quantity]
     if quantity == "change":
@@ -471,20 +482,17 @@ def _hall_entities(
         show_labels=True,
     )
     yield f"{path}/rows", rows
-    # CRAC units are drawn outside the end walls.
-    unit_centres_m = [
-        (x + (0.5 if x > plan.length_m / 2 else -0.5), y, height_m / 2)
-        for x, y in unit_places_m(plan, units)
-    ]
     boxes = rr.Boxes3D(
-        centers=unit_centres_m,
-        sizes=[(0.8, 1.2, height_m)] * units,
+        centers=unit_centres_m(hall, units),
+        half_sizes=[unit_half_size_m(hall)] * units,
         fill_mode="solid",
         colors=[80, 170, 230],
         labels=[f"CRAC {unit}" for unit in range(units)],
         show_labels=units <= MAX_UNIT_LINES,
     )
     yield f"{path}/crac", boxes
+    style = rr.Boxes3D.from_fields(fill_mode="solid", colors=DOWN_RGB, show_labels=True)
+    yield f"{path}/down", style
 
 
 def _unit_lines(units: int, quantity: str) -> tuple[list[str], list[int]]:
@@ -519,17 +527,31 @@ def _colour_bar(path: str, scale: ColourScale) -> Entities:
     yield f"{path}/bar", annotation_context(scale)
     yield f"{path}/bar", rr.SegmentationImage(gradient, opacity=1.0)
 
-    def points(values: Sequence[float], texts: Sequence[str], y: float) -> rr.Points2D:
-        x = (np.array(values) - scale.low) / (scale.high - scale.low) * width
+    def places(values: Sequence[float]) -> npt.NDArray[np.float64]:
+        return (np.array(values) - scale.low) / (scale.high - scale.low) * width
+
+    def points(
+        x: npt.NDArray[np.float64], y: float, texts: Sequence[str] = (), radius: float = 1.5
+    ) -> rr.Points2D:
         return rr.Points2D(
             np.stack([x, np.full_like(x, y)], axis=1),
-            radii=rr.Radius.ui_points(1.5),
+            radii=rr.Radius.ui_points(radius),
             colors=_LABEL_RGB,
-            labels=texts,
-            show_labels=True,
+            labels=texts or None,
+            show_labels=bool(texts),
         )
 
-    yield f"{path}/ticks", points(ticks, [f"{tick:g} {scale.unit}" for tick in ticks], height + 2.0)
+    names = [f"{tick:g} {scale.unit}" for tick in ticks]
+    yield f"{path}/ticks", points(places(ticks), height + 2.0, names)
     if scale.marks:
-        texts = [f"{name} {value:g}" for value, name in scale.marks]
-        yield f"{path}/limits", points([value for value, _ in scale.marks], texts, -8.0)
+        x = places([value for value, _ in scale.marks])
+        yield f"{path}/limits", points(x, -2.0)
+        # The viewer draws labels below their points. Those of limits at an end of the bar are
+        # moved inwards, because an edge of the view would cut them.
+        inside = np.clip(x, _LIMIT_LABEL_EDGE, width - _LIMIT_LABEL_EDGE)
+        has_space = np.diff(inside, append=np.inf) >= _LIMIT_LABELS_APART
+        texts = [
+            f"{name} {value:g}" if fits else f"{value:g}"
+            for (value, name), fits in zip(scale.marks, has_space, strict=True)
+        ]
+        yield f"{path}/limit_names", points(inside, -25.0, texts, 0.0)

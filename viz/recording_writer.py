@@ -33,7 +33,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.hall.air_metrics import USUAL_CLASS, allowable_c, rank
+from sdc_taichi.hall.air_metrics import allowable_c, rank
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, Reals, StepResult
 
@@ -49,6 +49,7 @@ from .recording_racks import (
     TRENDS,
     HottestRow,
     check_selection,
+    down_boxes,
     down_columns,
     down_texts,
     mark_columns,
@@ -338,10 +339,14 @@ class RecordingWriter:
         if not changes:
             return
         steps = np.array([step for step, _ in changes])
-        columns = down_columns([units for _, units in changes], self._unit_pixels[index])
+        down = [units for _, units in changes]
+        columns = down_columns(down, self._unit_pixels[index])
         times = self._times(steps)[index]
         self._output.add_columns(f"{path}/map/down", times, columns)
-        texts = down_texts([units for _, units in changes])
+        hall = self._fleet.configs[self._focus[index]].hall
+        boxes = down_boxes(down, hall, len(self._unit_pixels[index]))
+        self._output.add_columns(f"{path}/hall/down", times, boxes)
+        texts = down_texts(down)
         self._output.add_columns(f"{path}/map/down_text", times, texts)
 
     def _open(self) -> None:
@@ -404,10 +409,7 @@ class RecordingWriter:
             for quantity, field in _MEANS_OF_MAPS.items()
         }
         inlets = colour_scales.inlet_scale(
-            self._inlet_range,
-            first["inlet"],
-            (limits_c[index], max(limits_c)),
-            classes[index] or USUAL_CLASS,
+            self._inlet_range, first["inlet"], (limits_c[index], max(limits_c))
         )
         rise_k = float(np.percentile(np.abs(first["rise"]), 99.9))
         resolution_k = 0.1 if rise_k < 9.0 else 0.5

@@ -1,10 +1,12 @@
-"""Screenshots of a cooling failure in the native Rerun viewer, which needs no screen.
+"""Screenshots of recordings in the native Rerun viewer, which needs no screen.
 
     python docs/make/screenshots.py docs/img
 
 Two of six CRAC units go down one after the other on a July day. FOLDER/rerun_failure.webp shows the
-viewer while both are down, FOLDER/rerun_hot_spot.webp the heat map before, during and after. The
-viewer needs a Vulkan driver; one that computes on the CPU is enough (Debian: mesa-vulkan-drivers).
+viewer while both are down, FOLDER/rerun_hot_spot.webp the heat map before, during and after.
+FOLDER/rerun_airflow.webp shows the airflow of a mixed hall and FOLDER/rerun_zones.webp the zones of
+102,400 racks, each while a CRAC unit is down. The viewer needs a Vulkan driver; one that computes
+on the CPU is enough (Debian: mesa-vulkan-drivers).
 """
 
 from __future__ import annotations
@@ -44,6 +46,23 @@ HOT_SPOT = {
 MAP = "rack inlet [C]"
 """Name of the view with the heat map."""
 BATTERY_SHARE = 0.1
+UNIT_DOWN = "events.scheduled=[{{kind: crac_down, unit: {}, start_h: 14, duration_h: 3}}]"
+"""Failure of a CRAC unit, as a value of the configuration."""
+LARGE_HALL = (
+    "name=hall",
+    "site.start=07-01",
+    "hall.rows=320",
+    "hall.racks_per_row=320",
+    "hall.supply_approach_k=5",
+    "hall.return_approach_k=-3",
+    "hvac.crac.units=24",
+    UNIT_DOWN.format(9),
+)
+MIXED_HALL = ("name=hall", "site.start=07-01", UNIT_DOWN.format(2))
+DAY = 96
+"""Steps of a day, of 15 minutes each."""
+LARGE_HALL_STEPS = 68
+"""Steps of the run of the large hall, which ends with the failure of its CRAC unit."""
 MARGIN = 8
 """Margin around the coloured part of the heat maps, in pixels."""
 GREETING_S = 5.0
@@ -73,6 +92,15 @@ def failing_hall() -> Simulator:
         "{kind: crac_down, unit: 3, start_h: 15, duration_h: 2}]",
     ]
     return Simulator(load_config("corrected", values))
+
+
+def record_idle(path: Path, sim: Simulator, steps: int) -> None:
+    """Record steps of a run without commands."""
+    sim.reset()
+    with Recorder(path) as recorder:
+        recorder.begin(sim)
+        for _ in range(steps):
+            recorder.add(sim.step())
 
 
 def record(path: Path, sim: Simulator) -> list[StepResult]:
@@ -161,6 +189,20 @@ def screenshot(viewer: ViewerClient, moment: str, view: str | None = None) -> Im
     return Image.open(io.BytesIO(pictures[-1])).convert("RGB")
 
 
+def open_tabs(viewer: ViewerClient, *names: str) -> None:
+    """Open tabs of the recording by their names."""
+    blueprint = viewer.get_blueprint().blueprint
+    for parts in blueprint.values():
+        container = parts.get("ContainerBlueprint", {})
+        if container.get("container_kind") != "Tabs":
+            continue
+        for part in container["contents"]:
+            fields = blueprint[part].get("ContainerBlueprint", blueprint[part].get("ViewBlueprint"))
+            if fields.get("display_name") in names:
+                container["active_tab"] = part
+    viewer.set_blueprint(blueprint, "recording")
+
+
 def crop_to_racks(views: Mapping[str, Image.Image]) -> dict[str, Image.Image]:
     """The part of views of one size that is coloured in any of them, with a margin."""
     pixels = np.stack([np.asarray(view).astype(int) for view in views.values()])
@@ -187,17 +229,39 @@ def side_by_side(pictures: Mapping[str, Image.Image], columns: int = 3) -> Image
     return whole
 
 
+def draw_failure(recording: Path) -> dict[str, Image.Image]:
+    """Screenshots of the hall of which two CRAC units fail."""
+    with failing_hall() as sim:
+        record(recording, sim)
+    with native_viewer(recording) as viewer:
+        maps = {label: screenshot(viewer, moment, MAP) for moment, label in HOT_SPOT.items()}
+        time.sleep(GREETING_S)
+        whole = screenshot(viewer, BOTH_DOWN)
+    return {"failure": whole, "hot_spot": side_by_side(crop_to_racks(maps))}
+
+
+def draw_tabs(recording: Path, *tabs: str) -> Image.Image:
+    """Screenshot of tabs of a recording while a CRAC unit of its hall is down."""
+    with native_viewer(recording) as viewer:
+        open_tabs(viewer, *tabs)
+        time.sleep(GREETING_S)
+        return screenshot(viewer, BOTH_DOWN)
+
+
 def main(folder: Path) -> None:
     """Write the screenshots."""
     with tempfile.TemporaryDirectory() as scratch:
         recording = Path(scratch) / "failure.rrd"
-        with failing_hall() as sim:
-            record(recording, sim)
-        with native_viewer(recording) as viewer:
-            maps = {label: screenshot(viewer, moment, MAP) for moment, label in HOT_SPOT.items()}
-            time.sleep(GREETING_S)
-            whole = screenshot(viewer, BOTH_DOWN)
-    for name, picture in (("failure", whole), ("hot_spot", side_by_side(crop_to_racks(maps)))):
+        pictures = draw_failure(recording)
+        for name, preset, values, steps, tabs in (
+            ("airflow", "hall_of_2026", MIXED_HALL, DAY, ["airflow"]),
+            ("zones", "large", LARGE_HALL, LARGE_HALL_STEPS, ["zones", "zone 3"]),
+        ):
+            recording = Path(scratch) / f"{name}.rrd"
+            with Simulator(load_config(preset, list(values))) as sim:
+                record_idle(recording, sim, steps)
+            pictures[name] = draw_tabs(recording, *tabs)
+    for name, picture in pictures.items():
         picture.save(folder / f"rerun_{name}.webp", quality=75, method=6)
 
 
