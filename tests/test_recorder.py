@@ -978,10 +978,12 @@ def test_racks_of_changed_zones_are_recorded_within_a_budget(
             inside, edge = shown_c[step, int(y), int(x)], shown_c[step, int(y - 2.9), int(x)]
             assert abs(inside - result.rack_inlet_c[racks].mean()) < 0.051
             assert abs(edge - result.rack_inlet_max_c[racks].max()) < 0.051
-    labels = [label for (label,) in recorded["/dc/large/zones/hottest"]["Points2D:labels"]]
+    labels = [label for (label,) in recorded["/dc/large/zones/hottest_text"]["Points2D:labels"]]
     for label, result in zip(labels, results, strict=True):
         rack = int(result.rack_inlet_max_c.argmax())
-        assert label.endswith(f"C, row {rack // hall.racks_per_row}, rack {rack}")
+        zone = int(zones.of_racks(np.array([rack]))[0])
+        place = f"zone {zone}, row {rack // hall.racks_per_row}, rack {rack}"
+        assert label.startswith(f"hottest: {place}, ")
     recorded_racks = np.zeros(20, np.int64)
     for zone in range(zones.count):
         entity = recorded[f"/dc/large/zone_racks/{zone}"]

@@ -53,6 +53,8 @@ MAP_TITLES = {
     "power": "rack power",
 }
 """Titles of the maps, keyed by quantity."""
+MAX_UNIT_LABELS = 8
+"""Largest number of CRAC units of a 3D hall with a label each; more would cover the racks."""
 MAX_ROW_LABELS = 5
 """Largest number of labels of rows in the 3D hall; more labels would cover each other."""
 _MAP_BACKGROUND = (20, 20, 20)
@@ -488,7 +490,7 @@ def _hall_entities(
         fill_mode="solid",
         colors=[80, 170, 230],
         labels=[f"CRAC {unit}" for unit in range(units)],
-        show_labels=units <= MAX_UNIT_LINES,
+        show_labels=units <= MAX_UNIT_LABELS,
     )
     yield f"{path}/crac", boxes
     style = rr.Boxes3D.from_fields(fill_mode="solid", colors=DOWN_RGB, show_labels=True)
@@ -528,7 +530,7 @@ def _colour_bar(path: str, scale: ColourScale) -> Entities:
     yield f"{path}/bar", rr.SegmentationImage(gradient, opacity=1.0)
 
     def places(values: Sequence[float]) -> npt.NDArray[np.float64]:
-        return (np.array(values) - scale.low) / (scale.high - scale.low) * width
+        return (np.asarray(values, np.float64) - scale.low) * (width / (scale.high - scale.low))
 
     def points(
         x: npt.NDArray[np.float64], y: float, texts: Sequence[str] = (), radius: float = 1.5

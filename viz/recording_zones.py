@@ -27,7 +27,7 @@ from .recording_frames import (
     class_format,
     placed,
 )
-from .recording_racks import MARK_TEXT_RGB
+from .recording_racks import MARK_RGB, MARK_TEXT_RGB
 from .recording_text import rack_place
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ TOLERANCE_K = 0.25
 MOST_RACKS_PER_STEP = 6_400
 """Largest number of racks that a step records again, which bounds its size."""
 _LABEL_RGB = (135, 135, 135)  # legible on dark and on light backgrounds
+_BESIDE_PIXELS = 4.0
+"""Distance of the number of a zone from the map of zones, in pixels."""
 _TILE_PIXELS = 6
 """Height of the tile of a zone, in pixels, and smallest width."""
 
@@ -162,15 +164,20 @@ class ZonePictures:
         shape = blocks * (height + 1) - 1, sections * (width + 1) - 1
         yield "zones/map", classes
         yield "zones/map", class_format(shape)
-        names = [str(zone) for zone in range(self.zones.count)]
-        corners = zone_pixels(self.zones) * [1.0, 0.0] + [1.0 - width / 2.0, 0.0]
-        corners[:, 1] = zone_pixels(self.zones)[:, 1] - height / 2.0
-        labels = rr.Points2D(corners, radii=0.0, colors=_LABEL_RGB, labels=names, show_labels=True)
+        # Numbers of zones are beside the map, because no colour is legible on all tiles. Those
+        # between the first and the last section have no space.
+        sides = {0: -_BESIDE_PIXELS, sections - 1: shape[1] + _BESIDE_PIXELS}
+        names = [str(zone) for zone in range(self.zones.count) if zone % sections in sides]
+        top = zone_pixels(self.zones)[:, 1] - height / 2.0
+        places = [(sides[int(zone) % sections], top[int(zone)]) for zone in names]
+        labels = rr.Points2D(places, radii=0.0, colors=_LABEL_RGB, labels=names, show_labels=True)
         yield "zones/names", labels
-        style = rr.Points2D.from_fields(
-            radii=rr.Radius.ui_points(5.0), colors=MARK_TEXT_RGB, show_labels=True
-        )
+        style = rr.Points2D.from_fields(radii=rr.Radius.ui_points(5.0), colors=MARK_RGB)
         yield "zones/hottest", style
+        text = rr.Points2D(
+            [(shape[1] / 2.0, -0.13 * shape[0])], radii=0.0, colors=MARK_TEXT_RGB, show_labels=True
+        )
+        yield "zones/hottest_text", text
         yield "zone_racks", classes
         grid = tile_grid(self._hall)
         pixel = grid.tile_width + grid.gap, grid.tile_height + grid.gap
@@ -195,12 +202,13 @@ class ZonePictures:
             steps, hottest_racks = self._hottest.take()
             per_row = self._hall.racks_per_row
             zones = self.zones.of_racks(np.array([rack for rack, _ in hottest_racks]))
-            labels = [f"{c:.1f} C, {rack_place(rack, per_row)}" for rack, c in hottest_racks]
-            yield (
-                "zones/hottest",
-                steps,
-                rr.Points2D.columns(positions=zone_pixels(self.zones)[zones], labels=labels),
-            )
+            labels = [
+                f"hottest: zone {zone}, {rack_place(rack, per_row)}, {c:.1f} C"
+                for zone, (rack, c) in zip(zones.tolist(), hottest_racks, strict=True)
+            ]
+            positions = zone_pixels(self.zones)[zones]
+            yield "zones/hottest", steps, rr.Points2D.columns(positions=positions)
+            yield "zones/hottest_text", steps, rr.Points2D.columns(labels=labels)
         for zone, zone_frames in enumerate(self._zone_racks):
             if len(zone_frames):
                 steps, inlets_c = zone_frames.take()

@@ -55,7 +55,9 @@ LARGE_HALL = (
     "hall.racks_per_row=320",
     "hall.supply_approach_k=5",
     "hall.return_approach_k=-3",
-    "hvac.crac.units=24",
+    "hall.servers_per_rack=4",
+    "servers.power_w=[4000, 400]",
+    "hvac.crac.units=40",
     UNIT_DOWN.format(9),
 )
 MIXED_HALL = ("name=hall", "site.start=07-01", UNIT_DOWN.format(2))
@@ -255,7 +257,7 @@ def main(folder: Path) -> None:
         pictures = draw_failure(recording)
         for name, preset, values, steps, tabs in (
             ("airflow", "hall_of_2026", MIXED_HALL, DAY, ["airflow"]),
-            ("zones", "large", LARGE_HALL, LARGE_HALL_STEPS, ["zones", "zone 3"]),
+            ("zones", "large", LARGE_HALL, LARGE_HALL_STEPS, ["zones", "zone 5"]),
         ):
             recording = Path(scratch) / f"{name}.rrd"
             with Simulator(load_config(preset, list(values))) as sim:
