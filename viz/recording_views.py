@@ -9,13 +9,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import F64
 
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, annotation_context, invisible_names
@@ -529,12 +529,11 @@ def _colour_bar(path: str, scale: ColourScale) -> Entities:
     yield f"{path}/bar", annotation_context(scale)
     yield f"{path}/bar", rr.SegmentationImage(gradient, opacity=1.0)
 
-    def places(values: Sequence[float]) -> npt.NDArray[np.float64]:
-        return (np.asarray(values, np.float64) - scale.low) * (width / (scale.high - scale.low))
+    def places(values: Sequence[float]) -> F64:
+        share = (np.array(values) - scale.low) / (scale.high - scale.low)
+        return np.asarray(share * width, np.float64)
 
-    def points(
-        x: npt.NDArray[np.float64], y: float, texts: Sequence[str] = (), radius: float = 1.5
-    ) -> rr.Points2D:
+    def points(x: F64, y: float, texts: Sequence[str] = (), radius: float = 1.5) -> rr.Points2D:
         return rr.Points2D(
             np.stack([x, np.full_like(x, y)], axis=1),
             radii=rr.Radius.ui_points(radius),

@@ -169,8 +169,8 @@ class ZonePictures:
         sides = {0: -_BESIDE_PIXELS, sections - 1: shape[1] + _BESIDE_PIXELS}
         names = [str(zone) for zone in range(self.zones.count) if zone % sections in sides]
         top = zone_pixels(self.zones)[:, 1] - height / 2.0
-        places = [(sides[int(zone) % sections], top[int(zone)]) for zone in names]
-        labels = rr.Points2D(places, radii=0.0, colors=_LABEL_RGB, labels=names, show_labels=True)
+        beside = [(sides[int(zone) % sections], top[int(zone)]) for zone in names]
+        labels = rr.Points2D(beside, radii=0.0, colors=_LABEL_RGB, labels=names, show_labels=True)
         yield "zones/names", labels
         style = rr.Points2D.from_fields(radii=rr.Radius.ui_points(5.0), colors=MARK_RGB)
         yield "zones/hottest", style
