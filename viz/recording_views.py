@@ -493,7 +493,10 @@ def _hall_entities(
         show_labels=units <= MAX_UNIT_LABELS,
     )
     yield f"{path}/crac", boxes
-    style = rr.Boxes3D.from_fields(fill_mode="solid", colors=DOWN_RGB, show_labels=True)
+    # In small halls the label of the unit itself is at the same place.
+    style = rr.Boxes3D.from_fields(
+        fill_mode="solid", colors=DOWN_RGB, show_labels=units > MAX_UNIT_LABELS
+    )
     yield f"{path}/down", style
 
 
