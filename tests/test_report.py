@@ -361,6 +361,19 @@ def test_report_of_variants_is_about_the_hall(variants: Path) -> None:
     assert len(report.report_html(found.runs["today"], found)) < 1_500_000
 
 
+def test_reports_of_large_halls_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulate(tmp_path, [load_config("hall_of_2026", ["site.start=07-01"])], 30, "g36")
+    run = read_run(tmp_path)
+    html = report.report_html(run)
+    assert 100_000 < len(html.encode()) < 1_500_000
+    most = int(0.85 * len(html.encode()))
+    monkeypatch.setattr(report_html, "MAX_BYTES", most)
+    smaller = report.report_html(run)
+    assert len(smaller.encode()) <= most
+    before, after = (pictures(read_page(each)) for each in (html, smaller))
+    assert [image.size for image in after] == [image.size for image in before]
+
+
 def test_runs_of_other_length_are_refused(folder: Path, tmp_path: Path) -> None:
     simulate(tmp_path / "short", two_halls(), STEPS, done=50)
     done = call(folder / "greedy", tmp_path / "short", "--out", tmp_path / "x.html")

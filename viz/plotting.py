@@ -29,11 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 DPI = 100
 """Default resolution of pictures, in pixels per inch."""
-LOSSY_QUALITY = 60
-"""Quality of WebP images that are encoded with losses, 0..100."""
 MAX_LABELLED_RACKS = 60
 """Largest number of racks of a hall whose racks show their values as numbers."""
 MIN_COLOUR_RANGE_K = 2.0
@@ -73,33 +72,40 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
-def webp(figure: Figure, dpi: int = DPI, *, colours: int | None = None) -> tuple[int, int, bytes]:
-    """Encode a figure as a lossless WebP image, which has two thirds of the size of a PNG.
+def drawn(figure: Figure, dpi: int = DPI) -> Image:
+    """Draw a figure as an image.
 
     Args:
         figure: the figure.
         dpi: resolution, in pixels per inch.
-        colours: None for a lossless image. A number, up to 256, reduces the image to so many
-            colours, or encodes it with losses of ``LOSSY_QUALITY`` if this takes less space.
-
-    Returns:
-        Width and height of the image in pixels, and the bytes of the WebP file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
+    from PIL.Image import fromarray
 
     figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
     with _without_glyph_warnings():
         canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    encodings = [io.BytesIO()]
-    if colours is not None:
-        encodings.append(io.BytesIO())
-        picture.save(encodings[1], "WEBP", quality=LOSSY_QUALITY, method=4)
-        picture = picture.quantize(colours, dither=Image.Dither.NONE).convert("RGB")
-    picture.save(encodings[0], "WEBP", lossless=True, method=2, quality=0)
-    return (*picture.size, min((each.getvalue() for each in encodings), key=len))
+    return fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def webp(image: Image, colours: int, quality: int) -> bytes:
+    """Encode an image as WebP, in the smaller of two ways.
+
+    Args:
+        image: the image.
+        colours: number of colours of the encoding without further losses, up to 256.
+        quality: quality of the encoding with losses, 0..100.
+    """
+    from PIL.Image import Dither, Quantize
+
+    lossy, lossless = io.BytesIO(), io.BytesIO()
+    image.save(lossy, "WEBP", quality=quality, method=4)
+    # Rare colours, such as those of the hottest racks, keep a place among few colours.
+    method = Quantize.MEDIANCUT if colours == 256 else Quantize.MAXCOVERAGE
+    reduced = image.quantize(colours, method, dither=Dither.NONE).convert("RGB")
+    reduced.save(lossless, "WEBP", lossless=True, method=4, quality=60)
+    return min(lossy.getvalue(), lossless.getvalue(), key=len)
 
 
 def darken(figure: Figure) -> None:

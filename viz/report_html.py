@@ -20,7 +20,7 @@ from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR, day_of_year, step_ti
 from sdc_taichi.run.folder_reader import RunFolder
 from sdc_taichi.run.folder_writer import METRICS_FILE
 
-from .plotting import darken, date_text, format_number, webp
+from .plotting import darken, date_text, drawn, format_number, webp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,8 +29,13 @@ PICTURE_DPI = 110
 """Highest resolution of pictures in reports, in pixels per inch."""
 MAX_WIDTH_PX = 1216
 """Largest width of a picture in a report, in pixels; it is the width of the page on a screen."""
-COLOURS = 256
-"""Number of colours of a picture, which keeps reports small; it is enough for colour maps."""
+ENCODINGS = ((256, 60), (96, 45), (48, 30), (24, 15))
+"""Number of colours and quality of lossy encoding of the pictures of a report, best first. The
+first is used with which the report has at most ``MAX_BYTES``, else the last."""
+MAX_BYTES = 1_500_000
+"""Size of a report, in bytes, above which its pictures get fewer colours."""
+IMAGES = frozenset({"data", "dark_data"})
+"""Names of the images in the content of a block."""
 LONG_WORD = 24
 """Smallest length of words in a table, such as hashes, that may be broken when printed."""
 DASH = "–"
@@ -78,13 +83,30 @@ def html_page(
         sections: blocks of each section, keyed by its heading.
         own_page: headings of the sections that begin a new page when printed.
     """
-    page = str(_macros().page(title, lead, sections, own_page))
-    return "\n".join(map(printable, page.split("\n")))
+    for encoding in ENCODINGS:
+        encoded = {
+            heading: [_encoded(block, encoding) for block in blocks]
+            for heading, blocks in sections.items()
+        }
+        page = str(_macros().page(title, lead, encoded, own_page))
+        html = "\n".join(map(printable, page.split("\n")))
+        if len(html.encode("utf-8", "replace")) <= MAX_BYTES:
+            break
+    return html
 
 
 def html_blocks(blocks: Sequence[Block]) -> str:
     """Return blocks as HTML, as they appear in a page."""
-    return str(_macros().blocks(blocks))
+    return str(_macros().blocks([_encoded(block, ENCODINGS[0]) for block in blocks]))
+
+
+def _encoded(block: Block, encoding: tuple[int, int]) -> Block:
+    """Return a block whose images are texts in base 64, in an encoding of ``ENCODINGS``."""
+    content = {
+        name: base64.b64encode(webp(value, *encoding)).decode() if name in IMAGES else value
+        for name, value in block.content.items()
+    }
+    return Block(block.macro, content)
 
 
 def picture(figure: Figure, alt: str, caption: str) -> Block:
@@ -96,16 +118,15 @@ def picture(figure: Figure, alt: str, caption: str) -> Block:
         caption: text below the picture.
     """
     dpi = min(PICTURE_DPI, round(MAX_WIDTH_PX / figure.get_figwidth()))
-    width, height, data = webp(figure, dpi, colours=COLOURS)
+    image = drawn(figure, dpi)
     darken(figure)
-    *_, dark_data = webp(figure, dpi, colours=COLOURS)
     return Block(
         "picture",
         {
-            "data": base64.b64encode(data).decode(),
-            "dark_data": base64.b64encode(dark_data).decode(),
-            "width": width,
-            "height": height,
+            "data": image,
+            "dark_data": drawn(figure, dpi),
+            "width": image.width,
+            "height": image.height,
             "alt": alt,
             "caption": caption,
         },
