@@ -89,23 +89,29 @@ def drawn(figure: Figure, dpi: int = DPI) -> Image:
     return fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
-def webp(image: Image, colours: int, quality: int) -> bytes:
-    """Encode an image as WebP, in the smaller of two ways.
+def webp(image: Image, colours: int | None = None, quality: int = 60) -> bytes:
+    """Encode an image as WebP.
 
     Args:
         image: the image.
-        colours: number of colours of the encoding without further losses, up to 256.
+        colours: None for a lossless image, which has two thirds of the size of a PNG. A number, up
+            to 256, reduces the image to so many colours, or encodes it with losses if this takes
+            less space.
         quality: quality of the encoding with losses, 0..100.
     """
     from PIL.Image import Dither, Quantize
 
-    lossy, lossless = io.BytesIO(), io.BytesIO()
-    image.save(lossy, "WEBP", quality=quality, method=4)
-    # Rare colours, such as those of the hottest racks, keep a place among few colours.
-    method = Quantize.MEDIANCUT if colours == 256 else Quantize.MAXCOVERAGE
-    reduced = image.quantize(colours, method, dither=Dither.NONE).convert("RGB")
-    reduced.save(lossless, "WEBP", lossless=True, method=4, quality=60)
-    return min(lossy.getvalue(), lossless.getvalue(), key=len)
+    encodings = [io.BytesIO()]
+    if colours is None:
+        image.save(encodings[0], "WEBP", lossless=True, method=2, quality=0)
+    else:
+        encodings.append(io.BytesIO())
+        image.save(encodings[1], "WEBP", quality=quality, method=4)
+        # Rare colours, such as those of the hottest racks, keep a place among few colours.
+        method = Quantize.MEDIANCUT if colours == 256 else Quantize.MAXCOVERAGE
+        reduced = image.quantize(colours, method, dither=Dither.NONE).convert("RGB")
+        reduced.save(encodings[0], "WEBP", lossless=True, method=4, quality=60)
+    return min((each.getvalue() for each in encodings), key=len)
 
 
 def darken(figure: Figure) -> None:

@@ -29,7 +29,7 @@ from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.learning.evaluation_table import literal_markdown, markdown
 from sdc_taichi.learning.policy import FOLDERS
-from sdc_taichi.viz.plotting import webp
+from sdc_taichi.viz.plotting import drawn, webp
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -132,7 +132,7 @@ def section(
     end += f"{', '.join(commands)}. {literal_markdown(about)}"
     for picture in case_pictures(board)[:1]:
         path = f"img/benchmark-{suite.name}.webp"
-        write(docs / path, webp(picture.draw(), 80)[-1])
+        write(docs / path, webp(drawn(picture.draw(), 80)))
         parts.append(f"![Intervals of the rows of suite {suite.name}]({path})")
         caption = picture.caption.replace("picture", f"picture of case {board.case.name}", 1)
         end = f"{literal_markdown(caption)} {end}"

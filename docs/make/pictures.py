@@ -28,7 +28,7 @@ from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
 from sdc_taichi.viz import dashboards, figures, fleet_figures, rack_maps
 from sdc_taichi.viz.figures import clock_text, draw_hall, hall_map, overview, step_time
-from sdc_taichi.viz.plotting import DPI, format_time_axis, new_figure, webp
+from sdc_taichi.viz.plotting import DPI, drawn, format_time_axis, new_figure, webp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +47,7 @@ CONTROLLERS = {
 
 def save(figure: Figure, path: Path, dpi: int = DPI) -> None:
     """Write a picture as WebP."""
-    path.write_bytes(webp(figure, dpi)[2])
+    path.write_bytes(webp(drawn(figure, dpi)))
 
 
 def draw_week(folder: Path) -> None:
