@@ -761,3 +761,29 @@ def test_dense_halls_warm_faster_without_cooling() -> None:
         rates.append((inlet_c[9] - inlet_c[2]) / 7)
     assert rates[0] < rates[1] < rates[2]
     assert 1.5 * rates[0] < rates[2] < 3.0 * rates[0]
+
+
+@pytest.mark.parametrize("tank", ["stratified", "mixed"])
+@pytest.mark.parametrize("tank_down", [False, True])
+def test_power_after_a_restart_of_the_chiller_has_no_jumps(tank: str, tank_down: bool) -> None:
+    """The plant cools warm water and tank, in weather near the limits of its operation."""
+    # Among others, tank just full, plant just short of the heat, economiser just of use.
+    wet_bulb_c = np.concatenate([start + 0.002 * np.arange(5) for start in (4.598, 6.186, 10.064)])
+    steps = 24
+    events = ["{kind: chiller_derate, start_h: 0.0666667, duration_h: 0.1, share: 0}"]
+    if tank_down:
+        events.append("{kind: tank_down, start_h: 0.0833333, duration_h: 0.1333333, share: 0}")
+    config = load_config("corrected", [
+        "simulation.thermal=transient", "simulation.steps_per_hour=60",
+        "hvac.sizing.design_wet_bulb_c=25.6", "hvac.sizing.design_outdoor_c=33",
+        "workload.max_utilisation=1", "hvac.chilled_water.tank_m3=5",
+        f"hvac.chilled_water.tank={tank}", f"events.scheduled=[{', '.join(events)}]",
+    ])  # fmt: skip
+    same = np.ones((len(wet_bulb_c), steps))
+    wet = same * wet_bulb_c[:, None]
+    drivers = drivers_from_arrays(wet + 3.0, wet, 300.0 * same, 0.8 * same)
+    with Simulator([config] * len(wet_bulb_c), drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        hvac_w = np.array([sim.step().hvac_w for _ in range(steps)]).reshape(steps, 3, 5)
+    jumps = np.abs(np.diff(hvac_w, axis=2)) / hvac_w[:, :, 1:]
+    assert np.max(jumps) < 0.02

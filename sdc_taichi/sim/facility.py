@@ -54,6 +54,9 @@ from sdc_taichi.types import (
 WARMER_K, LESS_LOAD = 2.0, 0.9
 """Warmth of water and air, in K, and load divided by capacity, at which the growth of the plant's
 heat is evaluated."""
+SHORT_BAND = 0.1
+"""Share of the heat of coils and warm water which a plant does not remove, above which the growths
+of its heat with warmth and load count in full."""
 VALVE_BAND_K = 1.0
 """Warmth of the water above its setpoint at which all valves are open, in K."""
 
@@ -152,7 +155,8 @@ class Facility:
 
         Free cooling removes more heat from warmer water and air. The heat that the plant can remove
         is therefore ``limit_w`` plus the growths times the warmth of the water and the heat at the
-        coils. Both growths are 0 where the plant can remove all heat that coils and pumps bring.
+        coils. Both growths are 0 where the plant can remove all heat that coils and pumps bring,
+        and begin gradually where it cannot, so that small causes have small effects.
 
         Args:
             surroundings: Weather and failures.
@@ -184,8 +188,11 @@ class Facility:
         if not self._event_free:
             design = replace(design, pumped_w=design.pumped_w * surroundings.pump_share)
         offered_w = capacity_w + self._while_powered(warmth_w(air.warmed_k, design), surroundings)
-        short = removed_w < offered_w * (1.0 - ROUND_OFF_SHARE)
-        per_k, per_w = (np.where(short, np.maximum(x, 0.0), 0.0) for x in (per_k, per_w))
+        missing = (1.0 - ROUND_OFF_SHARE) - removed_w / np.maximum(offered_w, LEAST_PUMPED_W)
+        short = np.clip(missing / SHORT_BAND, 0.0, 1.0)
+        # A watt more at the coils cannot let the plant remove more than a watt more, but the plant
+        # may operate differently at less load.
+        per_k, per_w = short * per_k, short * np.clip(per_w, 0.0, 1.0)
         return {
             "limit_w": removed_w - per_k * air.warmed_k - per_w * capacity_w,
             "limit_w_per_k": per_k,
@@ -211,8 +218,12 @@ class Facility:
         plant = self._operate(requested_w, *at)
         if self._transient:
             carried_w = np.maximum(self._carried_w(inputs), 0.0)
-            fullest = self._operate(carried_w, *at, inputs.air.most_warmed_k)
-            plant = completed(plant, fullest, requested_w)
+            # A plant that cools water and tank removes more than the coils bring.
+            fullest_w = np.maximum(carried_w, requested_w)
+            fullest = self._operate(fullest_w, *at, inputs.air.most_warmed_k)
+            # The valves open with the warmth of the water, however long the plant works in full.
+            pump_w = plant.chilled_pump_w
+            plant = replace(completed(plant, fullest, requested_w), chilled_pump_w=pump_w)
             opened = np.minimum(inputs.air.most_warmed_k / VALVE_BAND_K, 1.0)
             least_w = opened * fullest.chilled_pump_w
             plant = self._with_coil_pumps(plant, carried_w, least_w, inputs.surroundings)
