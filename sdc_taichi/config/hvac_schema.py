@@ -247,8 +247,10 @@ class ChillerConfig(Section):
     max_condenser_c: Annotated[float, Field(ge=20, le=80)] = 40.0
     """Highest temperature of the condenser water that enters the chiller, in C, 20..80: from cold
     climates to heat pumps. Where the tower cannot hold it, the control of the head pressure unloads
-    the chiller. The default follows from a cut-out of 1 bar above air pressure with R-123,
-    46 to 48 C of condensation at 93 % of it, minus the range of the water and 1 to 2 K."""
+    the chiller. The default assumes that a machine with R-123 unloads below 1 bar above air
+    pressure, at which its rupture disc breaks (Trane CVHE-SVN02D-EN): 46 to 48 C of condensation
+    at 93 % of it (the setting of Trane CVGF-SVX03B-EN), minus the range of the water and 1 to
+    2 K."""
     min_lift_k: Annotated[float, Field(ge=0.1, le=50)] = MIN_LIFT_K
     """Smallest lift of the compressor (entering condenser water minus leaving chilled water), in K,
     for models ``centrifugal_vsd`` and ``carnot``, 0.1..50: the COP of ``carnot`` diverges at 0 K,

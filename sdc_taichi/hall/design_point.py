@@ -287,8 +287,8 @@ def _check_face_velocity(config: DataCenterConfig, design: DesignPoint) -> None:
 
     Servers could do with less air if it became warmer, so racks are judged at the largest usual
     temperature rise, ``MOST_USUAL_RISE_K``. The densest racks that are cooled by air alone hold
-    four servers of 14.3 kW and 0.73 m3/s each (NVIDIA 2024, *DGX B200 User Guide*): 57 kW and 2.3
-    m/s through a front of 0.6 m x 2.1 m.
+    four servers of 14.3 kW each (NVIDIA 2024, *DGX B200 User Guide*): 57 kW and, if their air warms
+    by 16 K (assumed), 2.3 m/s through a front of 0.6 m x 2.1 m.
     """
     most_m_s, layout = config.hall.most_face_velocity_m_s, config.hall.layout
     face_m2 = layout.rack_pitch_m * layout.rack_height_m
