@@ -288,7 +288,7 @@ class HottestRow:
     def _labels(self, columns: Sequence[str], height: int, width: int) -> rr.Points2D:
         """Return labels of times below the picture, and of racks at its left side."""
         ticks = np.unique(
-            np.linspace(0, len(columns) - 1, min(5, len(columns))).round().astype(int)
+            np.linspace(0, len(columns) - 1, min(3, len(columns))).round().astype(int)
         )
         # The first and the last time may be at the same day, of which the time of day suffices.
         part = slice(6, None) if columns[0][:5] == columns[-1][:5] else slice(0, 5)
