@@ -15,7 +15,7 @@ from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.recirculation import calibrate
-from sdc_taichi.run.rack_places import study_places
+from sdc_taichi.run.rack_places import place_values, study_places
 
 
 def call(*arguments: object) -> Result:
@@ -173,6 +173,30 @@ def test_limits_of_cooling_and_redundancy_are_told(tmp_path: Path) -> None:
     assert one["hottest_inlet_unit_down_c"] >= one["hottest_inlet_c"]
     cold = placed(path, "--count", 1, "--limit-c", 18)["candidates"][0]
     assert cold["exceeded"] == [f"inlet {cold['hottest_inlet_c']:.1f} C"]
+
+
+def test_some_places_in_a_large_hall_fit() -> None:
+    """The example of docs/hall.md."""
+    words = ["place", "hall_of_2026", "--type", "gpu_dense", "--count", "8"]
+    words += ["--replace", "storage", "--limit-c", "26.8", "--json"]
+    done = CliRunner().invoke(hall_app, words)
+    assert done.exit_code == 0, done.output
+    candidates = json.loads(done.stdout)["candidates"]
+    fits = [each["fits"] for each in candidates]
+    assert any(fits)
+    assert not all(fits)
+    assert fits == sorted(fits, reverse=True)
+    assert all(each["fits"] == (each["hottest_inlet_c"] < 26.8) for each in candidates)
+
+
+def test_places_without_steady_air_are_told() -> None:
+    """With a unit down, the coils of the others cannot cool the air that the racks draw."""
+    study = study_places(load_config("hall_of_2026"), "gpu", 1, replaced=["storage"], keep="n+1")
+    hottest_c = [each.lost_unit_c for each in study.candidates]
+    told = ["no steady air with a unit down" in each.exceeded for each in study.candidates]
+    assert told == [np.isinf(inlet_c) for inlet_c in hottest_c]
+    assert any(told)
+    json.dumps(place_values(study), allow_nan=False)
 
 
 def test_places_are_drawn_and_printed(tmp_path: Path) -> None:

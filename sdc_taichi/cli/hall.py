@@ -375,7 +375,7 @@ def _print_places(study: RackPlaces) -> None:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("exceeds")
     for each in study.candidates[:MOST_PLACES]:
-        lost = [] if each.lost_unit_c is None else [f"{each.lost_unit_c:.1f}"]
+        lost = [] if each.lost_unit_c is None else [f"{each.lost_unit_c:.1f}".replace("inf", "-")]
         table.add_row(
             each.places,
             f"{each.hottest_c:.1f}",

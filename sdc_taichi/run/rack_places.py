@@ -62,7 +62,8 @@ class Candidate:
     airflow_share: float
     """Airflow that the racks need from the CRAC units, divided by that at full speed."""
     lost_unit_c: float | None
-    """Hottest inlet if the worst single CRAC unit is down, in C; None if it was not studied."""
+    """Hottest inlet if the worst single CRAC unit is down, in C; inf if there is no steady air,
+    None if it was not studied."""
     exceeded: tuple[str, ...]
     """Limits that the candidate exceeds, in words; empty if the racks fit."""
 
@@ -166,6 +167,7 @@ def study_places(
         flow_m3s = base_fleet.unit_design_m3s
         lost_airflow = airflow_share * flow_m3s.sum() / (flow_m3s.sum() - flow_m3s.max())
         lost_c = np.full(len(configs), -np.inf)
+        solver.flags_limits = True
         for unit in range(base_fleet.units):
             running = np.tile(np.arange(base_fleet.units) != unit, len(configs)).astype(float)
             case = _solve(fleet, solver, running)
@@ -179,7 +181,9 @@ def study_places(
             over.append(f"airflow {100 * airflow_share[i]:.0f} % of the CRAC units")
         if inlet_c.max() > limit_c + LEAST_EXCESS_K:
             over.append(f"inlet {inlet_c.max():.1f} C")
-        if keep == "n+1" and lost_c[i] > limit_c + LEAST_EXCESS_K:
+        if np.isinf(lost_c[i]):
+            over.append("no steady air with a unit down")
+        elif keep == "n+1" and lost_c[i] > limit_c + LEAST_EXCESS_K:
             over.append(f"{lost_c[i]:.1f} C with a unit down")
         if keep == "n+1" and lost_airflow[i] > 1 + LEAST_SHORTFALL:
             over.append(f"airflow {100 * lost_airflow[i]:.0f} % with a unit down")
@@ -244,7 +248,9 @@ def place_values(study: RackPlaces) -> dict[str, Any]:
                 "hottest_rack": each.hottest_rack,
                 "it_kw": each.it_kw,
                 "airflow_share": each.airflow_share,
-                "hottest_inlet_unit_down_c": each.lost_unit_c,
+                "hottest_inlet_unit_down_c": None
+                if each.lost_unit_c is None or np.isinf(each.lost_unit_c)
+                else each.lost_unit_c,
             }
             for each in study.candidates
         ],
@@ -256,11 +262,11 @@ class _Solved:
     """N halls of R racks at full load."""
 
     rack_inlet_c: F64
-    """Hottest inlet of each rack, in C, (N, R)."""
+    """Hottest inlet of each rack, in C, (N, R); inf in halls without steady air."""
     it_kw: F64
     """IT power of each hall, in kW, (N,)."""
     cooling_kw: F64
-    """Heat of servers and CRAC fans, in kW, (N,)."""
+    """Heat of servers and CRAC fans, in kW, (N,); 0 in halls without steady air."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,7 +404,11 @@ def _solve(fleet: Fleet, solver: Hall, running: F64) -> _Solved:
     it_w = np.asarray(sums.cpu_w + sums.it_fan_w, dtype=np.float64)
     fan_w = fleet.values("hvac.crac.fan_w_per_m3s") * full_m3s * share**3
     inlet_c = np.array(sums.rack_inlet_max_c, dtype=np.float64).reshape(fleet.size, -1)
-    return _Solved(inlet_c, it_w / 1e3, (it_w + fan_w) / 1e3)
+    cooling_kw = (it_w + fan_w) / 1e3
+    if solver.beyond_limits is not None:
+        inlet_c[solver.beyond_limits] = np.inf
+        cooling_kw[solver.beyond_limits] = 0.0
+    return _Solved(inlet_c, it_w / 1e3, cooling_kw)
 
 
 def _needed_airflow_share(fleet: Fleet, solver: Hall) -> F64:
