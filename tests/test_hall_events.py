@@ -167,7 +167,8 @@ def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
         for j in range(20):
             hot = hottest[t, j]
             called = TRIPPED if hot > 32 + margin_k else THROTTLED if hot > 32 else NORMAL
-            kept_off = before[t, j] == TRIPPED and hot > 27
+            # Racks restart below the mean of the recommended and the allowable limit, 27 and 32 C.
+            kept_off = before[t, j] == TRIPPED and hot > 29.5
             assert status[t, j] == (TRIPPED if kept_off else called)
             seen[int(status[t, j])] = True
     assert all(seen.values()), "a status was never reached"
