@@ -183,10 +183,10 @@ def test_summary_says_what_ran(folder: Path, page: Page) -> None:
     when = with_local_time(hot)["time"].iloc[hottest_row]
     dc = total["hottest_dc"]
     racks = next(c for c in two_halls() if c.name == dc).hall.racks_per_row
-    row, rack = divmod(total["hottest_rack"], racks)
+    rack = total["hottest_rack"]
     assert (
         f"The hottest inlet was {total['hottest_inlet_c']:.4g} °C in {' '.join(dc.split())}, "
-        f"row {row}, rack {rack}, server {total['hottest_server']} from the floor, on "
+        f"row {rack // racks}, rack {rack}, server {total['hottest_server']} from the floor, on "
         f"{when.day} {when:%B %H:%M}."
     ) in page.text
 

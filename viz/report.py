@@ -245,8 +245,7 @@ def _hottest_inlet_text(run: RunFolder) -> str:
     dc = run.names.index(where)
     moment = time_text(run, local_time(run, dc, total["hottest_step"]))
     hours = run.metrics["data_centers"][dc]["metrics"]["inlet_above_27_h"]
-    (config,) = read_configs(run, [dc])
-    row, rack = divmod(total["hottest_rack"], config.hall.racks_per_row)
+    row, rack = total["hottest_row"], total["hottest_rack"]
     recommended = f"{RECOMMENDED_C[1]:g} °C, the highest recommended inlet"
     above = (
         f"An inlet there was above {recommended}, for {format_number(hours)} h, "

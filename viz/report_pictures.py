@@ -233,10 +233,11 @@ def rack_maps_blocks(runs: Mapping[str, RunFolder], dc: ShownDataCenter) -> list
     allowable = allowable_c(dc.config.protection.ashrae_class)[1]
     racks_of = {label: read_racks(run, [dc.index])[0] for label, run in runs.items()}
     hours = dc.racks["hottest_h"].to_numpy()
-    row, rack = divmod(int(hours.argmax()), hall.racks_per_row)
+    rack = int(hours.argmax())
     others = int(np.count_nonzero(hours == hours.max())) - 1
     most_often = (
-        f"Most often the hottest was row {row}, rack {rack}{f' and {others} more' * (others > 0)}: "
+        f"Most often the hottest was row {rack // hall.racks_per_row}, rack {rack}"
+        f"{f' and {others} more' * (others > 0)}: "
         f"{100 * hours.max() / first.hours:.0f} % of the time. "
         if len(runs) == 1
         else ""
