@@ -221,9 +221,7 @@ class Facility:
             # A plant that cools water and tank removes more than the coils bring.
             fullest_w = np.maximum(carried_w, requested_w)
             fullest = self._operate(fullest_w, *at, inputs.air.most_warmed_k)
-            # The valves open with the warmth of the water, however long the plant works in full.
-            pump_w = plant.chilled_pump_w
-            plant = replace(completed(plant, fullest, requested_w), chilled_pump_w=pump_w)
+            plant = completed(plant, fullest, requested_w)
             opened = np.minimum(inputs.air.most_warmed_k / VALVE_BAND_K, 1.0)
             least_w = opened * fullest.chilled_pump_w
             plant = self._with_coil_pumps(plant, carried_w, least_w, inputs.surroundings)
