@@ -34,7 +34,7 @@ from .recording_frames import (
     rack_pixels,
     rgb,
 )
-from .recording_racks import unit_pixels
+from .recording_racks import DOWN_RGB, unit_pixels
 from .recording_series import PALETTE, RED, Cadence
 from .recording_text import rack_place
 
@@ -53,8 +53,8 @@ UNIT_COLOURS = tuple(colour for colour in PALETTE if colour != RED)
 """Colours of CRAC units in turn, as 0xRRGGBBAA; red marks units that are down."""
 MAX_UNIT_LABELS = 8
 """Largest number of labels of CRAC units at a wall; more would cover each other."""
-_DOWN_COLOUR = 0xFF3C3CFF
-"""Colour of units that are down, as ``DOWN_RGB`` on the heat maps."""
+_DOWN_COLOUR = int.from_bytes((*DOWN_RGB, 255))
+"""Colour of units that are down, as 0xRRGGBBAA."""
 NO_UNIT = 0
 """Class of racks that no CRAC unit supplies, in the share map."""
 _GREY_RGB = np.array([110.0, 110.0, 110.0])

@@ -22,6 +22,7 @@ from .colour_scales import ColourScale, annotation_context, invisible_names
 from .recording_racks import (
     DOWN_RGB,
     TRENDS,
+    UNIT_RGB,
     mark_entities,
     unit_centres_m,
     unit_half_size_m,
@@ -488,7 +489,7 @@ def _hall_entities(
         centers=unit_centres_m(hall, units),
         half_sizes=[unit_half_size_m(hall)] * units,
         fill_mode="solid",
-        colors=[80, 170, 230],
+        colors=UNIT_RGB,
         labels=[f"CRAC {unit}" for unit in range(units)],
         show_labels=units <= MAX_UNIT_LABELS,
     )

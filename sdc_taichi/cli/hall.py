@@ -375,7 +375,8 @@ def _print_places(study: RackPlaces) -> None:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("exceeds")
     for each in study.candidates[:MOST_PLACES]:
-        lost = [] if each.lost_unit_c is None else [f"{each.lost_unit_c:.1f}".replace("inf", "-")]
+        lost = [] if each.lost_unit_c is None else [f"{each.lost_unit_c:.1f}"]
+        lost = lost if each.has_steady_air else ["-"]
         table.add_row(
             each.places,
             f"{each.hottest_c:.1f}",

@@ -67,6 +67,11 @@ class Candidate:
     exceeded: tuple[str, ...]
     """Limits that the candidate exceeds, in words; empty if the racks fit."""
 
+    @property
+    def has_steady_air(self) -> bool:
+        """False if there is no steady air with a CRAC unit down."""
+        return self.lost_unit_c is None or bool(np.isfinite(self.lost_unit_c))
+
 
 @dataclass(frozen=True, slots=True)
 class RackPlaces:
@@ -248,9 +253,7 @@ def place_values(study: RackPlaces) -> dict[str, Any]:
                 "hottest_rack": each.hottest_rack,
                 "it_kw": each.it_kw,
                 "airflow_share": each.airflow_share,
-                "hottest_inlet_unit_down_c": None
-                if each.lost_unit_c is None or np.isinf(each.lost_unit_c)
-                else each.lost_unit_c,
+                "hottest_inlet_unit_down_c": each.lost_unit_c if each.has_steady_air else None,
             }
             for each in study.candidates
         ],
