@@ -24,17 +24,18 @@ def queue_kernel() -> Any:
     rows. A task processes TASK_ROWS rows of TASK_BLOCKS vectors together, in memory order. It does
     not read the oldest rows that are known to be 0.
 
-    Arguments. All but the first four are arrays with the layout of
+    Arguments. All but the first five are arrays with the layout of
     ``compiler.arrays.vector_rows``, with data centers as entries:
 
     - serial: True if the calling thread does all work.
+    - delay: age of work that enters from other sites, in steps, less than L; 0 if there is none.
     - one: always 1, see "Loops of step 1" in README.md.
     - negligible: largest amount of work that counts as rounding error and has no age.
     - due_row: row of the queue that is due when the next step starts, L for none, (vectors, lanes).
     - empty_rows: number of the oldest rows of a vector that are 0 after the step, input and output,
       (vectors,).
     - before: queues before the step, (L, vectors).
-    - moved: work removed, and work added, (2, vectors).
+    - moved: work removed, work added, and work added with the age ``delay``, (3, vectors).
     - after: output, queues after the step, (L, vectors).
     - statistics: output, (4, vectors): waiting work, work that will be due, age of the oldest work
       in steps, and mean age in steps.
@@ -47,6 +48,7 @@ def queue_kernel() -> Any:
     @no_type_check
     def queue_after(
         serial: ti.template(),
+        delay: ti.template(),
         one: ti.i32,
         negligible: ti.f64,
         due_row: ints,
@@ -80,11 +82,17 @@ def queue_kernel() -> Any:
                         out, filled = moved[0, block], statistics[0, block]
                         aged, waited = statistics[2, block], statistics[3, block]
                         k, zero_end = row, ti.min(empty_rows[block], row_end)
+                        if ti.static(delay > 0):
+                            zero_end = ti.min(zero_end, last - delay)
                         while k < zero_end:
                             after[k, block] = zeros
                             k += one
                         while k < row_end:
                             left = before[k + 1, block] - out
+                            if ti.static(delay > 0):
+                                left = ti.select(left > zeros, left, zeros)
+                                if k >= last - delay:
+                                    left += moved[2, block]
                             filled += ti.select(left > zeros, ones, zeros)
                             left = ti.select(left > zeros, left, zeros)
                             after[k, block] = left

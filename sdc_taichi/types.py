@@ -119,6 +119,11 @@ class Actions:
     """Temperature of the chilled water that leaves the plant, in C, shape () or (B,): at most the
     coldest supply temperature of the running CRAC units less ``hvac.chiller.coil_approach_k``, and
     within the range of the chiller model. None gives the warmest water that these limits allow."""
+    transfer: F64 | None = None
+    """Share of the arriving flexible work of each site (row) to send to each site of its fleet
+    (column), (B, S), S being ``Fleet.sites_per_fleet``. Values are limited to 0..1 and the sum of a
+    row to 1; a site's own column counts as 0. What links and rooms do not allow stays. None sends
+    nothing."""
 
 
 @dataclass(slots=True)
@@ -145,6 +150,9 @@ class State:
     queue: F64
     """Cumulative sum of the queued tasks by the step in which they arrived, oldest step first,
     shape (B, L) with L the number of arrival steps that a queue distinguishes; read-only."""
+    in_flight: F64
+    """Work on its way to each data center by the number of steps until it arrives, the next step
+    first, in tasks, (B, ``fleet.delay_steps``); (B, 0) for data centers that share no work."""
     stored_kwh: F64
     """Energy in the battery, in kWh, (B,)."""
     room_heat_kwh: F64
@@ -258,13 +266,32 @@ class CommandQuantities:
 
 
 @dataclass
+class TransferQuantities:
+    """Work that sites of a fleet send to each other in one step; 0 for data centers alone."""
+
+    sent_tasks: Annotated[F64, Quantity("tasks")]
+    """Arriving work that leaves for other sites; part of ``arrived_tasks``."""
+    landed_tasks: Annotated[F64, Quantity("tasks")]
+    """Work of other sites that arrives, with the age it has."""
+    refused_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that was to leave, and stays because of the limits of links or a lack of room."""
+    transfer_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy of transfers, half of it at either end in the step of departure; not part of
+    ``grid_kwh``."""
+    transfer_g: Annotated[F64, Quantity("g CO2e")]
+    """Emissions of ``transfer_kwh`` at the site's carbon intensity; not part of ``carbon_g``."""
+    in_flight_tasks: Annotated[F64, Quantity("tasks")]
+    """Work on its way to the data center at the end of the step."""
+
+
+@dataclass
 class WorkQuantities:
     """Work that arrives, starts, waits and leaves in one step."""
 
     utilisation: Annotated[F64, Quantity("1")]
     """Started work as a share of capacity, including ``lost_tasks``."""
     arrived_tasks: Annotated[F64, Quantity("tasks")]
-    """Work that arrived."""
+    """Work that arrived, without work of other sites."""
     deferred_tasks: Annotated[F64, Quantity("tasks")]
     """Work that entered the queue."""
     drained_tasks: Annotated[F64, Quantity("tasks")]
@@ -558,6 +585,7 @@ class StepResult(
     HallQuantities,
     SetpointQuantities,
     QueueQuantities,
+    TransferQuantities,
     WorkQuantities,
     CommandQuantities,
     SiteQuantities,

@@ -38,9 +38,10 @@ def options(**more: Any) -> dict[str, Any]:
 
 
 def test_costs_are_what_their_names_say() -> None:
-    env = sdc_taichi.vector_env(2, **options(costs=list(COSTS)))
+    names = [name for name in COSTS if not name.startswith("fleet_")]
+    env = sdc_taichi.vector_env(2, **options(costs=names))
     env.reset(seed=0)
-    sums = dict.fromkeys(COSTS, 0.0)
+    sums = dict.fromkeys(names, 0.0)
     for _ in range(20):
         *_, infos = env.step({a: np.array([0, 2]) for a in AGENTS})
         tasks = infos["overdue_tasks"] + infos["dropped_tasks"] + infos["lost_tasks"]

@@ -27,6 +27,7 @@ from sdc_taichi.config.fields import (
     WorkingShare,
     check_one_per_rack,
 )
+from sdc_taichi.config.fleet_schema import FleetConfig
 from sdc_taichi.config.hall_schema import (
     MOST_RACK_J_PER_K,
     MOST_RACK_U,
@@ -219,6 +220,8 @@ class DataCenterConfig(Section):
     """Location, input files, and first day of a run."""
     simulation: SimulationConfig = SimulationConfig()
     """Time step and thermal mass."""
+    fleet: FleetConfig | None = None
+    """Sites that share work; None describes a data center alone."""
 
     @model_validator(mode="after")
     def _air_models_fit_together(self) -> Self:
@@ -304,6 +307,21 @@ class DataCenterConfig(Section):
                     f"workload.{name} {hours:g} h is {steps:g} steps; valid is a whole number of "
                     f"steps of {60 // self.simulation.steps_per_hour} min"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _work_can_move(self) -> Self:
+        if self.fleet is None:
+            return self
+        if self.workload.model != "fluid":
+            raise ValueError(f"workload.model {self.workload.model}: a fleet needs fluid")
+        hours = self.workload.deadline_h or self.workload.age_horizon_h
+        steps = round(hours * self.simulation.steps_per_hour)
+        if self.fleet.delay_steps > steps:
+            raise ValueError(
+                f"fleet.delay_steps {self.fleet.delay_steps}: work would arrive after its "
+                f"deadline; valid is 1..{steps}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -51,9 +51,34 @@ def grid_overload(result: StepResult, view: View) -> F64:
     return result.grid_overload_kwh
 
 
+def fleet_power(result: StepResult, view: View) -> F64:
+    """Energy that a fleet draws above its power budget, in kWh, given to sites by their shares."""
+    shared = view.fleet.shared_work
+    assert shared is not None
+    budget_kw, ratio = shared.power_limit_kw, shared.power_limit_ratio
+    by_ratio_kw = ratio * shared.fleet_sums(view.sizing.facility_w) / 1e3
+    limit_kw = np.where(np.isnan(budget_kw), by_ratio_kw, budget_kw)
+    return shared.excess(result.grid_kwh, limit_kw * result.step_h)
+
+
+def fleet_carbon(result: StepResult, view: View) -> F64:
+    """Emissions of a fleet, with transfers, above the step's part of its daily budget, in g."""
+    shared = view.fleet.shared_work
+    assert shared is not None
+    emitted = result.carbon_g + result.transfer_g
+    return shared.excess(emitted, shared.carbon_limit_g_per_h * result.step_h)
+
+
 COSTS: dict[str, CostFunction] = {
     function.__name__: function
-    for function in (hot_inlets, throttled_racks, overdue_work, grid_overload)
+    for function in (
+        hot_inlets,
+        throttled_racks,
+        overdue_work,
+        grid_overload,
+        fleet_power,
+        fleet_carbon,
+    )
 }
 """Built-in costs by name."""
 _registered: dict[str, CostFunction] = {}
@@ -108,6 +133,21 @@ class Costs:
                 "costs: grid_overload is always 0 without a limit; valid with "
                 "electrical.grid_limit_kw or grid_limit_ratio"
             )
+        shared = fleet.shared_work
+        for name, budgets in (
+            ("fleet_power", ("power_limit_kw", "power_limit_ratio")),
+            ("fleet_carbon", ("carbon_limit_kg_per_day",)),
+        ):
+            has_budget = shared is not None and any(
+                c.fleet is not None and getattr(c.fleet, field) is not None
+                for c in fleet.configs
+                for field in budgets
+            )
+            if self._functions.get(name) is COSTS[name] and not has_budget:
+                raise ConfigError(
+                    f"costs: {name} is always 0 without a budget; valid with "
+                    f"fleet.{' or '.join(budgets)}"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:

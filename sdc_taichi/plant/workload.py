@@ -42,6 +42,11 @@ class WorkPoint(NamedTuple):
     """Highest utilisation, 0..1, (B,)."""
     queue_limit: Values
     """Longest queue, in tasks, (B,)."""
+    sent: Values = 0.0
+    """Flexible part of the arriving work that leaves for other sites, in tasks, (B,); only for
+    ``fluid``."""
+    landed: Values = 0.0
+    """Flexible work of other sites that arrives, in tasks, (B,); only for ``fluid``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +60,7 @@ class WorkModel:
 
 
 def fluid(point: WorkPoint) -> Work:
-    """Step arbitrarily divisible work, with arrived = executed + queued + dropped.
+    """Step arbitrarily divisible work: arrived - sent + landed = executed + queued + dropped.
 
     A negative command defers the share ``-command`` of the flexible work. A positive command drains
     the queue with the share ``command`` of the free capacity (paper, A.1.3). Work beyond the
@@ -64,11 +69,12 @@ def fluid(point: WorkPoint) -> Work:
     """
     arrived = point.demand * TASKS_PER_STEP
     capacity = point.max_utilisation * TASKS_PER_STEP
-    flexible = point.flexible_share * arrived
-    wanted = arrived - np.maximum(-point.command, 0.0) * flexible
+    flexible = np.maximum(point.flexible_share * arrived - point.sent, 0.0) + point.landed
+    at_site = arrived - point.sent + point.landed
+    wanted = at_site - np.maximum(-point.command, 0.0) * flexible
     forced = np.minimum(point.due, capacity)
     now = np.minimum(wanted, capacity - forced)
-    held_back = arrived - now
+    held_back = at_site - now
     deferred = np.minimum(held_back, _room(point.queue_limit, point.waiting - forced))
     drained = np.minimum(
         point.waiting - forced, np.maximum(point.command, 0.0) * (capacity - now - forced)

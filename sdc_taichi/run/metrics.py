@@ -25,6 +25,12 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
                      run covers only in part is weighted by the covered share
     cost             energy_cost + demand_charge, in the currency of the tariff
 
+Fleets whose sites share work also have:
+
+    moved_tasks      work that left for other sites; refused_tasks stayed for links or room
+    link_use         moved_tasks / what the links could carry; None without limits
+    transfer_kwh, transfer_g  energy and emissions of transfers, not part of grid_kwh and cfp_kg
+
 A ratio to IT energy is None if there is no IT energy.
 """
 
@@ -75,6 +81,10 @@ _SUMMED_FIELDS = (
     "rti_pct",
     "rci_hi_pct",
     "rci_lo_pct",
+    "sent_tasks",
+    "refused_tasks",
+    "transfer_kwh",
+    "transfer_g",
 )
 """Fields of ``StepResult`` that are summed over the steps."""
 _MEAN_FIELDS = ("shi", "rti_pct", "rci_hi_pct", "rci_lo_pct")
@@ -179,6 +189,7 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     """Compute the metrics of every data center, in fleet order; at least one step is needed."""
     throttle_min = times_to_throttle_min(totals)
     demand_charge = _demand_charge(totals, fleet)
+    link_tasks = _link_tasks(fleet)
     out = []
     for dc in range(fleet.size):
         sums = {name: float(values[dc]) for name, values in totals.sums.items()}
@@ -201,6 +212,7 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
                 "time_to_throttle_min": throttle_min[dc],
                 "hottest_step": int(totals.hottest_step[dc]),
             }
+            | ({} if link_tasks is None else _transfers(sums, link_tasks[dc] * totals.steps))
         )
     return out
 
@@ -220,6 +232,8 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     cost = _cost(
         sums, float(_demand_charge(totals, fleet).sum()), float(totals.demand.peak_kw.max())
     )
+    link_tasks = _link_tasks(fleet)
+    transfers = {} if link_tasks is None else _transfers(sums, link_tasks.sum() * totals.steps)
     return _energy_and_work(sums, totals.step_h) | {
         **cost,
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
@@ -237,6 +251,7 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
         "rci_hi_min_pct": float(totals.rci_hi_min_pct.min()),
         "time_to_throttle_min": min((x for x in throttle_min if x is not None), default=None),
         "hottest_step": int(totals.hottest_step[hottest]),
+        **transfers,
     }
 
 
@@ -252,6 +267,28 @@ def times_to_throttle_min(totals: Totals) -> list[float | None]:
         float(n * totals.step_h * 60.0) if throttled else None
         for n, throttled in zip(steps, throttles, strict=True)
     ]
+
+
+def _link_tasks(fleet: Fleet) -> F64 | None:
+    """Return the most work that each site can send in a step, (B,); None if all run alone."""
+    return None if fleet.shared_work is None else fleet.shared_work.link_tasks
+
+
+def _transfers(sums: dict[str, float], link_tasks: float) -> dict[str, Metric]:
+    """Return the metrics of transfers.
+
+    Args:
+        sums: Sum over the steps of each field of ``_SUMMED_FIELDS``, by name.
+        link_tasks: Most work that could be sent in these steps, in tasks, inf for no limit.
+    """
+    moved = sums["sent_tasks"]
+    return {
+        "moved_tasks": moved,
+        "refused_tasks": sums["refused_tasks"],
+        "link_use": moved / float(link_tasks) if 0 < link_tasks < np.inf else None,
+        "transfer_kwh": sums["transfer_kwh"],
+        "transfer_g": sums["transfer_g"],
+    }
 
 
 def _demand_charge(totals: Totals, fleet: Fleet) -> F64:

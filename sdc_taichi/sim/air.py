@@ -29,7 +29,7 @@ _AXES = {"unit": "U", "rack": "R"}
 """Axes of the fields of ``HallSums`` by the first part of their names; all other fields have one
 entry per data center, B."""
 STATE_AXES = {
-    **dict.fromkeys(("queue", "stored_kwh", "room_heat_kwh"), "B"),
+    **dict.fromkeys(("queue", "in_flight", "stored_kwh", "room_heat_kwh"), "B"),
     **dict.fromkeys(("water_heat_j", "tank_heat_j"), "B"),
     **dict.fromkeys(("setpoint_c", "cooling_run", "cooling_last", "fan_speed"), "U"),
     **dict.fromkeys(("rack_status", "restart_wait_min"), "R"),

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import ConfigError, DataError
 from sdc_taichi.exogenous.carbon import MAX_CI_G_PER_KWH, Pairing
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
 from sdc_taichi.exogenous.series import (
@@ -29,7 +29,7 @@ from sdc_taichi.exogenous.series import (
     resample,
 )
 from sdc_taichi.exogenous.workload import read_workload
-from sdc_taichi.exogenous.year_clock import TYPICAL_YEAR, day_of_year, step_times
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR, TYPICAL_YEAR, day_of_year, step_times
 from sdc_taichi.types import F64, I64, Exogenous
 
 MAX_KEPT_BYTES = 2**28
@@ -126,7 +126,8 @@ class Drivers:
     demand: FleetSeries
     """Arriving work of a step as a share of capacity, 0..1."""
     start: I64
-    """First simulated step, counted from the beginning of the year, (B,)."""
+    """First simulated step, counted from the beginning of the year in local standard time, (B,).
+    Sites of a fleet that shares work begin at the same time in UTC."""
     year: I64
     """Calendar year of the first step in time stamps, (B,): that of the config, or else that of the
     weather, of the carbon intensity or of the workload, or else ``TYPICAL_YEAR``."""
@@ -237,6 +238,7 @@ class InputReader:
             for c in configs
         ]
         self._days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
+        self._shares_clock = np.array([c.fleet is not None for c in configs])
         self._years = [c.site.year for c in configs]
         self._cache: OrderedDict[_SiteKey | _TraceKey, SiteData | Series] = OrderedDict()
         self._cache_bytes = 0
@@ -276,6 +278,7 @@ class InputReader:
             self._design_c = self._design_temperatures()
         outdoor_c = fleet_series([of_sites[key].outdoor_c for key in site_keys])
         inputs = [(sites[s], series[t]) for s, t in zip(site_keys, trace_keys, strict=True)]
+        utc_offset_h = np.array([site.utc_offset_h for site, _ in inputs])
         return Drivers(
             outdoor_c=outdoor_c,
             wet_bulb_c=fleet_series([of_sites[key].wet_bulb_c for key in site_keys]).sharing_places(
@@ -285,14 +288,18 @@ class InputReader:
                 [of_sites[key].ci_g_per_kwh for key in site_keys]
             ).sharing_places(outdoor_c),
             demand=fleet_series([of_traces[key] for key in trace_keys]).sharing_places(outdoor_c),
-            start=self._days * 24 * self._steps_per_hour,
+            start=local_start(
+                self._days * 24 * self._steps_per_hour,
+                np.where(self._shares_clock, utc_offset_h, 0.0),
+                self._steps_per_hour,
+            ),
             year=np.array(
                 [
                     _calendar_year(year, site, trace)
                     for year, (site, trace) in zip(self._years, inputs, strict=True)
                 ]
             ),
-            utc_offset_h=np.array([site.utc_offset_h for site, _ in inputs]),
+            utc_offset_h=utc_offset_h,
             design_outdoor_c=self._design_c[0],
             design_wet_bulb_c=self._design_c[1],
             sources=tuple(
@@ -393,6 +400,30 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
         DataError: A file is not valid.
     """
     return InputReader(configs).read()
+
+
+def local_start(start_utc: I64, utc_offset_h: F64, steps_per_hour: int) -> I64:
+    """Return first steps in local standard time for first steps in UTC, (B,).
+
+    Both count from the beginning of a year of 8,760 h; a time before it is one of its last hours.
+
+    Args:
+        start_utc: First step of each data center in UTC, (B,).
+        utc_offset_h: Local standard time minus UTC, in h, (B,); see ``Drivers.utc_offset_h``.
+        steps_per_hour: Number of steps in an hour.
+
+    Raises:
+        ConfigError: An offset is no whole number of steps.
+    """
+    steps = utc_offset_h * steps_per_hour
+    if np.any(steps != np.rint(steps)):
+        offset_h = utc_offset_h[np.argmax(steps != np.rint(steps))]
+        raise ConfigError(
+            f"simulation.steps_per_hour {steps_per_hour}: a site of the fleet is {offset_h:g} h "
+            "from UTC; valid are steps that divide this time"
+        )
+    local = start_utc + steps.astype(np.int64)
+    return np.where(local < 0, local + HOURS_PER_YEAR * steps_per_hour, local)
 
 
 def is_file(trace: str) -> bool:

@@ -26,6 +26,8 @@ from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import in_row_order
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
+from sdc_taichi.sim.fleet_configs import with_sites
+from sdc_taichi.sim.shared_work import SharedWork, shared_work
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
@@ -150,6 +152,13 @@ class Fleet:
     """True if each CRAC unit draws its own return air, (B,); False with a single unit."""
     air: HallAir | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
+    shared_work: SharedWork | None
+    """Links and budgets of fleets of sites that share work; None if all data centers run alone."""
+
+    @property
+    def sites_per_fleet(self) -> int:
+        """Number S of consecutive data centers that share work; 1 if all run alone."""
+        return 1 if self.shared_work is None else self.shared_work.allowed.shape[1]
 
     @property
     def units(self) -> int:
@@ -294,10 +303,12 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     """Arrange data centers as flat arrays.
 
     Args:
-        configs: One data center, or several.
+        configs: One data center or fleet that shares work, or several; a config of a fleet stands
+            for the data centers of its sites.
 
     Raises:
-        ConfigError: There is no data center, or a field of ``SHARED_FIELDS`` differs.
+        ConfigError: There is no data center, a field of ``SHARED_FIELDS`` differs, or sites do not
+            fit together.
 
     Warns:
         OddInputWarning: A value is valid, but probably a mistake.
@@ -337,6 +348,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
             [c.hvac.crac.draws_own_return and models["inlet"] == "recirculation" for c in listed]
         ),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
+        shared_work=shared_work(listed),
     )
 
 
@@ -355,7 +367,7 @@ def _listed(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> tuple[Dat
             )
     if not listed:
         raise ConfigError("fleet: no data center given; valid is at least one")
-    return listed
+    return tuple(with_sites(listed))
 
 
 def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,11 @@ def make_configs(
 
     Copies at ``sites``, and those of a preset, are named after their location (see
     ``locations``); other copies keep the name of ``base``. If there are more copies than sites, a
-    name ends in the index of the copy.
+    name ends in the index of the copy. If ``base`` describes a fleet that shares work, each copy
+    is a whole fleet, with one data center per site of ``fleet.sites``.
 
     Args:
-        base: Config of the data center to copy.
+        base: Config of the data center or fleet to copy.
         count: Number of copies, which are assigned to the sites in rotation; None makes one copy
             per site.
         sites: Location names; an empty sequence keeps the location of ``base``.
@@ -43,16 +44,15 @@ def make_configs(
 
     Raises:
         ConfigError: ``count`` is below 1, ``sites`` are combined with a weather or carbon file of
-            ``base``, or a sampling rule or a sampled value is not valid.
+            ``base`` or with its fleet, or a sampling rule or a sampled value is not valid.
     """
     if isinstance(sites, str):
         raise ConfigError(f"sites {shortened(sites)}: valid is a list of names")
-    for field in ("weather_file", "carbon_file"):
-        if sites and (file := getattr(base.site, field)) is not None:
-            raise ConfigError(
-                f"sites {', '.join(sites)}: site.{field} {file!r} of {base.name} would be read for "
-                "each of them; valid is one of the two"
-            )
+    if sites and base.fleet is not None:
+        raise ConfigError(
+            f"sites {', '.join(sites)}: {base.name} has fleet.sites; valid is one of the two"
+        )
+    _check_files(base, sites)
     count = max(len(sites), 1) if count is None else count
     count = whole_number("fleet: count", count, 1, MOST_DCS)
     seed = whole_number("fleet: seed", seed, 0, 2**63 - 1)
@@ -73,12 +73,63 @@ def make_configs(
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, index])))
             config = with_values(config, {path: _draw(rule, rng) for path, rule in rules.items()})
         configs.append(config)
-    names = place_names(configs) if sites else names_of_runs(configs)
+    copies = with_sites(configs)
+    is_named = sites or len(copies) > len(configs)
+    names = place_names(copies) if is_named else names_of_runs(copies)
     digits = len(str(count - 1)) if count > max(len(sites), 1) else 0
+    per_copy = len(copies) // count
     return [
-        config.model_copy(update={"name": f"{name}-{index:0{digits}d}" if digits else name})
-        for index, (config, name) in enumerate(zip(configs, names, strict=True))
+        config.model_copy(
+            update={"name": f"{name}-{index // per_copy:0{digits}d}" if digits else name}
+        )
+        for index, (config, name) in enumerate(zip(copies, names, strict=True))
     ]
+
+
+def with_sites(configs: Iterable[DataCenterConfig]) -> list[DataCenterConfig]:
+    """Replace each config of a whole fleet by those of its sites, named after their locations.
+
+    Other configs stay as they are.
+
+    Raises:
+        ConfigError: A config of a fleet names a weather or carbon file.
+    """
+    expanded: list[DataCenterConfig] = []
+    sites_of: dict[int, list[DataCenterConfig]] = {}
+    for config in configs:
+        if config.fleet is None or config.fleet.place is not None:
+            expanded.append(config)
+            continue
+        if id(config) not in sites_of:
+            sites_of[id(config)] = _configs_of_sites(config)
+        expanded += sites_of[id(config)]
+    return expanded
+
+
+def _configs_of_sites(config: DataCenterConfig) -> list[DataCenterConfig]:
+    assert config.fleet is not None
+    _check_files(config, config.fleet.sites)
+    copies = []
+    for place, name in enumerate(config.fleet.sites):
+        update = {
+            "site": config.site.model_copy(update={"location": name.upper()}),
+            "fleet": config.fleet.model_copy(update={"place": place}),
+        }
+        copies.append(config.model_copy(update=update))
+    names = place_names(copies)
+    return [
+        copy.model_copy(update={"name": name}) for copy, name in zip(copies, names, strict=True)
+    ]
+
+
+def _check_files(base: DataCenterConfig, sites: Sequence[str]) -> None:
+    """Refuse weather and carbon files of a config that is copied to several sites."""
+    for field in ("weather_file", "carbon_file"):
+        if sites and (file := getattr(base.site, field)) is not None:
+            raise ConfigError(
+                f"sites {', '.join(sites)}: site.{field} {file!r} of {base.name} would be read for "
+                "each of them; valid is one of the two"
+            )
 
 
 def names_of_runs(configs: Sequence[DataCenterConfig]) -> list[str]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air, with_entries_of
@@ -28,6 +29,7 @@ from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.sim.stages import Stages, make_stages
 from sdc_taichi.sim.step_inputs import Commands, Surroundings
+from sdc_taichi.sim.transfer import TransferResult
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import I32, I64, Actions, ServerLayers, State, StepResult, joined
@@ -141,8 +143,9 @@ class Simulator:
                 center; None means 0. With a single seed, data centers with different names have
                 different events. Of data centers with equal names, the first uses the seed itself,
                 and the others use seeds drawn from it. All stages are deterministic.
-            start: First step of the run, counted from the beginning of the year, 0 to
-                ``LAST_START``, (B,); None uses the start of the drivers.
+            start: First step of the run, counted from the beginning of the year in local standard
+                time, 0 to ``LAST_START``, (B,); None uses the start of the drivers. Sites of a
+                fleet must begin at the same time in UTC, see ``local_start``.
             drivers: New inputs; None keeps the current inputs. Devices keep the sizes that they got
                 with the first inputs.
 
@@ -163,6 +166,7 @@ class Simulator:
                 f"{self.size} data centers"
             )
         inputs = replace(inputs, start=first.astype(np.int64))
+        self._check_clocks(inputs)
         self.continue_from(self._initial_state(seeds, inputs), inputs)
         self._first_state = self._state
         self._initial_start = initial
@@ -192,8 +196,15 @@ class Simulator:
         event = self._timeline.at(state.step)
         surroundings = stages.surroundings.at(exogenous, event, state.stored_kwh)
         capacity = stages.allocation.capacity(state, commands, surroundings)
+        transfer = stages.transfer.run(
+            state,
+            commands.transfer_shares,
+            surroundings.demand,
+            surroundings.ci_g_per_kwh,
+            capacity.utilisation,
+        )
         work = stages.workload.run(
-            state.queue, surroundings.demand, commands.load_command, capacity.utilisation
+            state.queue, surroundings.demand, commands.load_command, capacity.utilisation, transfer
         )
         placement = stages.allocation.place(state, commands, surroundings, work, capacity)
         supply = stages.crac_units.supply(state, commands, surroundings)
@@ -215,10 +226,10 @@ class Simulator:
         if self._flags_limits:
             self._last_air = air
         racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
-        stage_results = map(vars, (commands, surroundings, work, supply, air, racks))
+        stage_results = map(vars, (commands, surroundings, transfer, work, supply, air, racks))
         step = {"step": state.step, "step_h": self.step_h}
         result = StepResult(*_values_of_result(joined(step, *stage_results, plant)))
-        self._state = _next_state(state, work, supply, plant, racks, thermal)
+        self._state = _next_state(state, transfer, work, supply, plant, racks, thermal)
         return result
 
     def _hold_air(
@@ -420,6 +431,7 @@ class Simulator:
     def close(self) -> None:
         """Release state, inputs and kernel arrays; a closed simulator keeps only its ``fleet``."""
         if self._stages is not None:
+            self._stages.transfer.close()
             self._stages.workload.close()
         self._stages = self._state = self._drivers = self._last_air = self._first_state = None
 
@@ -455,6 +467,23 @@ class Simulator:
             )
         return with_prices(drivers, self.fleet.configs)
 
+    def _check_clocks(self, drivers: Drivers) -> None:
+        """Check that the sites of each fleet begin a run at the same time in UTC.
+
+        Raises:
+            ConfigError: They begin at different times.
+        """
+        per_hour = self.fleet.steps_per_hour
+        utc = (drivers.start - drivers.utc_offset_h * per_hour) % (HOURS_PER_YEAR * per_hour)
+        of_fleets = utc.reshape(-1, self.fleet.sites_per_fleet)
+        same = (of_fleets == of_fleets[:, :1]).reshape(-1)
+        if not same.all():
+            at = int(np.argmin(same))
+            raise ConfigError(
+                f"start {drivers.start[at]} of {self.fleet.names[at]}: sites of a fleet begin at "
+                "the same time in UTC; valid is a start of sdc_taichi.sim.drivers.local_start"
+            )
+
     def _seeds(self, seed: int | Sequence[int] | I64) -> I64:
         """Check a seed argument and return a seed for each data center, (B,)."""
         listed: list[Any] = np.ravel(seed).tolist() if np.ndim(seed) else [seed]
@@ -472,6 +501,7 @@ class Simulator:
 
 def _next_state(
     state: State,
+    transfer: TransferResult,
     work: WorkResult,
     supply: Supply,
     plant: Mapping[str, Any],
@@ -491,6 +521,7 @@ def _next_state(
         cooling_last=supply.cooling_last,
         fan_speed=supply.fan_speed,
         queue=work.queue,
+        in_flight=transfer.in_flight,
         stored_kwh=plant["stored_kwh"].copy(),
         room_heat_kwh=plant["room_heat_kwh"].copy(),
         rack_status=racks.rack_status.copy(),

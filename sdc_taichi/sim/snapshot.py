@@ -40,7 +40,7 @@ The limits detect damaged files. A state within the limits from which no physica
 raises a ``PhysicalLimitError`` in the next step."""
 OTHER_LIMITS = (-1e12, 1e12)
 """Minimum and maximum of the fields of ``State`` that ``LIMITS`` does not list."""
-VERSION = 4
+VERSION = 5
 """Version of the snapshot format."""
 
 

@@ -21,6 +21,7 @@ from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.step_inputs import ActionDecoder, SurroundingsModel, UnitIndex
+from sdc_taichi.sim.transfer import Transfer
 from sdc_taichi.sim.work_allocation import WorkAllocation
 from sdc_taichi.sim.workload import Workload
 from sdc_taichi.types import F64, I64, State
@@ -38,6 +39,8 @@ class Stages:
     """Converter from actions to commands."""
     surroundings: SurroundingsModel
     """Model of weather, demand and failures."""
+    transfer: Transfer
+    """Transfers of work between the sites of a fleet."""
     workload: Workload
     """Workload model and queues."""
     allocation: WorkAllocation
@@ -67,6 +70,7 @@ class Stages:
             cooling_last=supply.cooling_last,
             fan_speed=supply.fan_speed,
             queue=self.workload.empty_queue(),
+            in_flight=self.transfer.nothing_in_flight(),
             stored_kwh=fleet.values("battery.initial_soc") * self.sizing.battery_kwh,
             room_heat_kwh=np.zeros(fleet.size),
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
@@ -106,6 +110,7 @@ def make_stages(
         sizing=sizing,
         decoder=ActionDecoder(fleet, units),
         surroundings=SurroundingsModel(fleet, units, models.powered_share),
+        transfer=Transfer(fleet, sizing),
         workload=Workload(fleet),
         allocation=allocation,
         crac_units=CracUnits(fleet, units),
@@ -253,7 +258,9 @@ def _copies(
 
 
 def _without_memory(config: DataCenterConfig) -> DataCenterConfig:
-    """Return a config without events, protection and thermal storage, whose steps are independent.
+    """Return a config without events, protection, transfers and thermal storage.
+
+    Its steps are independent.
 
     Only queue and battery still connect the steps.
     """
@@ -261,6 +268,7 @@ def _without_memory(config: DataCenterConfig) -> DataCenterConfig:
     return config.model_copy(
         update={
             "events": EventsConfig(),
+            "fleet": None,
             "protection": ProtectionConfig(),
             "workload": work.model_copy(update={"model": "fluid", "max_utilisation": 1.0}),
             "simulation": simulation.model_copy(update={"thermal": "quasi_steady"}),

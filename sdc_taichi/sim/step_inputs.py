@@ -82,6 +82,9 @@ class Commands(CommandQuantities):
     """Relative load of each server group, (G,); None weighs all groups equally."""
     chilled_water_command_c: F64 | None
     """Commanded temperature of the chilled water, in C, (B,); None follows the setpoints."""
+    transfer_shares: F64 | None
+    """Share of each site's flexible work to send to each site of its fleet, (B, S); None sends
+    nothing."""
 
 
 class ActionDecoder:
@@ -124,6 +127,7 @@ class ActionDecoder:
             unit_fan_command=self._fan_command(wanted.fan),
             group_weights=self._group_weights(wanted.placement),
             chilled_water_command_c=self._chilled_water_command_c(wanted.chilled_water),
+            transfer_shares=self._transfer_shares(wanted.transfer),
         )
 
     def _fan_command(self, action: Any) -> F64 | None:
@@ -167,6 +171,31 @@ class ActionDecoder:
             f"action placement: shape {weights.shape}, expected ({racks},), one per rack, or "
             f"({groups},), one per server group"
         )
+
+    def _transfer_shares(self, action: Any) -> F64 | None:
+        """Return the shares of flexible work to send, (B, S), after a check."""
+        if action is None:
+            return None
+        sites = self._fleet.sites_per_fleet
+        if sites == 1:
+            raise SdcError(
+                "action transfer: given, but the data centers share no work; valid is None, or a "
+                "config with section fleet"
+            )
+        try:
+            shares = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SdcError(f"action transfer: {action!r} are no numbers") from None
+        if shares.shape != (self._size, sites):
+            raise SdcError(
+                f"action transfer: shape {shares.shape}, expected ({self._size}, {sites}), a row "
+                "per data center and a column per site of its fleet"
+            )
+        if not np.isfinite(shares).all():
+            raise SdcError(
+                f"action transfer: {shares[~np.isfinite(shares)][0]}; valid is a finite number"
+            )
+        return shares
 
     def _unit_command(self, name: str, action: Any, kind: type[Enum]) -> F64:
         """Return a command for each CRAC unit, (U,), from one for all, per data center or unit."""

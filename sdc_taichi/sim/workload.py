@@ -19,7 +19,7 @@ from sdc_taichi.kernels.compiler.arrays import unpadded, vector_rows
 from sdc_taichi.plant import workload
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, I32, QueueQuantities, Work, fields_of
+from sdc_taichi.types import F64, I32, QueueQuantities, TransferQuantities, Work, fields_of
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.launch import BoundKernel
@@ -71,10 +71,11 @@ class Queue:
     Args:
         length: Number L of arrival steps that a queue distinguishes.
         due_steps: Age at which work is due, in steps, inf for never, (B,).
+        delay_steps: Age of the work that enters as ``landed``, in steps; 0 if there is none.
     """
 
-    def __init__(self, length: int, due_steps: F64) -> None:
-        self._size, self._length = len(due_steps), length
+    def __init__(self, length: int, due_steps: F64, delay_steps: int = 0) -> None:
+        self._size, self._length, self._delay = len(due_steps), length, delay_steps
         self._due_row = due_entries(length, due_steps)
         self._kernel: BoundKernel | None = None
         self._rows: Any = None
@@ -97,23 +98,30 @@ class Queue:
             self._begin = queue[:, -1].copy(), due
         return self._begin
 
-    def end_step(self, queue: F64, dequeued: F64, deferred: F64) -> QueueState:
+    def end_step(
+        self, queue: F64, dequeued: F64, deferred: F64, landed: F64 | None = None
+    ) -> QueueState:
         """Update the queues and return them at the end of a step.
 
         Args:
             queue: Queues at the start of the step, (B, L); they become read-only.
             dequeued: Work that leaves each queue, oldest first, in tasks, (B,).
             deferred: Work that enters each queue, in tasks, (B,).
+            landed: Work that enters each queue with the age ``delay_steps``, in tasks, (B,); None
+                if there is none.
         """
         if queue is not self._last:
             self._load(queue)
         assert self._kernel is not None
         self._dequeued[:], self._deferred[:] = dequeued, deferred
+        if landed is not None:
+            self._landed[:] = landed
         # Invalid until the kernel has finished, in case the step is interrupted.
         self._last = None
         after = vector_rows(self._length, self._size)
         self._kernel(
             self._serial,
+            self._delay,
             1,
             NEGLIGIBLE_TASKS,
             self._due_lanes,
@@ -140,12 +148,12 @@ class Queue:
         from sdc_taichi.kernels.queue import SERIAL_UP_TO, queue_kernel
 
         runtime.ensure_started()
-        self._kernel = BoundKernel(queue_kernel(), templates=1)
+        self._kernel = BoundKernel(queue_kernel(), templates=2)
         self._serial = self._size <= SERIAL_UP_TO
         # These arrays are bound once: passing a new array costs more than copying a few entries.
-        self._moved, self._results = (vector_rows(n, self._size) for n in (2, 4))
+        self._moved, self._results = (vector_rows(n, self._size) for n in (3, 4))
         self._moved[:] = 0.0
-        self._dequeued, self._deferred = unpadded(self._moved, self._size)
+        self._dequeued, self._deferred, self._landed = unpadded(self._moved, self._size)
         self._statistics = unpadded(self._results, self._size)
         self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
         self._due_lanes.reshape(-1)[: self._size] = self._due_row
@@ -220,14 +228,22 @@ class Workload:
         )
         self._max_utilisation = v("workload.max_utilisation")
         self._length = queue_length(fleet)
-        self._queue = Queue(self._length, due_steps(fleet))
+        shared = fleet.shared_work
+        self._flexible_share = None if shared is None else limits["flexible_share"]
+        delay_steps = 0 if shared is None else shared.delay_steps
+        self._queue = Queue(self._length, due_steps(fleet), delay_steps)
 
     def empty_queue(self) -> F64:
         """Return empty queues, (B, L)."""
         return np.zeros((self._size, self._length))
 
     def run(
-        self, queue: F64, demand: F64, load_command: F64, max_utilisation: F64 | float
+        self,
+        queue: F64,
+        demand: F64,
+        load_command: F64,
+        max_utilisation: F64 | float,
+        transfer: TransferQuantities | None = None,
     ) -> WorkResult:
         """Run the workload model for a step and update the queues.
 
@@ -237,16 +253,32 @@ class Workload:
             load_command: Share to defer (below 0) or drain (above 0), -1..1, (B,).
             max_utilisation: Maximum work that the racks can run, as a share of all servers, (B,)
                 or one value for all.
+            transfer: Work that the sites of a fleet send and get in the step; None or that of data
+                centers alone moves nothing.
         """
         waiting, due = self._queue.begin_step(queue)
-        decided = self._decide(
-            demand=demand,
-            command=load_command,
-            waiting=waiting,
-            due=due,
-            max_utilisation=np.minimum(self._max_utilisation, max_utilisation),
-        )
-        after = self._queue.end_step(queue, decided["dequeued_tasks"], decided["deferred_tasks"])
+        point = {
+            "demand": demand,
+            "command": load_command,
+            "waiting": waiting,
+            "due": due,
+            "max_utilisation": np.minimum(self._max_utilisation, max_utilisation),
+        }
+        if self._flexible_share is None:
+            decided = self._decide(**point)
+            after = self._queue.end_step(
+                queue, decided["dequeued_tasks"], decided["deferred_tasks"]
+            )
+        else:
+            assert transfer is not None
+            decided = self._decide(**point, sent=transfer.sent_tasks, landed=transfer.landed_tasks)
+            # The youngest flexible work waits first, that of other sites after it.
+            own = self._flexible_share * decided["arrived_tasks"] - transfer.sent_tasks
+            deferred = decided["deferred_tasks"]
+            landed = np.clip(deferred - np.maximum(own, 0.0), 0.0, transfer.landed_tasks)
+            after = self._queue.end_step(
+                queue, decided["dequeued_tasks"], deferred - landed, landed
+            )
         return WorkResult(
             **decided,
             queue=after.queue,
