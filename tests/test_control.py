@@ -245,6 +245,13 @@ def test_every_name_runs(name: str, sim: Simulator, tmp_path: Path) -> None:
     if name == "policy:FOLDER":
         policy(interface_of(sim.fleet, make_options())).save(tmp_path)
     names = name.replace(":C", ":20").replace("FOLDER", str(tmp_path))
+    if name.startswith("geo-"):
+        with pytest.raises(ConfigError, match="data centers share no work; valid with a config"):
+            make_controller(name, sim.fleet)
+        with Simulator(load_config("fleet_of_eight")) as fleet:
+            sent = simulate(fleet, make_controller(name, fleet.fleet), 8, 1).sums["sent_tasks"]
+            assert sent.sum() > 0
+        return
     controller = make_controller(names, sim.fleet)
     assert simulate(sim, controller, 8, 1).steps == 8
 
@@ -270,6 +277,7 @@ def test_each_agent_may_have_its_own(sim: Simulator) -> None:
         ("load=g36", "'g36': does not act on load; valid for load: idle, random, greedy-ci"),
         ("battery=constant:20", "'constant:20': does not act on battery"),
         ("cool=g36", "'cool=g36': valid is agent=name .*did you mean 'cooling'"),
+        ("geo=mpc-24h", "'mpc-24h': does not act on geo; valid for geo: idle, geo-all-to-cleanest"),
         ("load=idle,load=random", "load is given twice"),
         ("load=idle,", "valid is agent=name"),
         ("constant:24", r"'constant:24': valid is a setpoint of 16\.\.23 C \(hvac\.setpoint of dc"),

@@ -9,9 +9,12 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from sdc_taichi import load_config, with_values
 from sdc_taichi.cli.app import app
 from sdc_taichi.run.folder_reader import read_run
+from sdc_taichi.run.metrics import empty_totals, metrics_of_fleet
 from sdc_taichi.run.steps_file import KEY_COLUMNS
+from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.types import DATA_CENTERS, QUANTITIES, meanings
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -51,6 +54,11 @@ def test_every_metric_is_documented(run_folder: Path) -> None:
     listed = names_in_first_column(text)
     keys, names = list(metrics), list(metrics["total"])
     assert names[:1] != []
-    assert sorted([*listed, "hottest_dc"]) == sorted([*keys, *names])
+    fleet = build_fleet(with_values(load_config("tiny"), {"fleet": {"sites": ["NY", "WA"]}}))
+    totals = empty_totals(2, 0.25)
+    totals.steps = 1
+    of_fleets = set(metrics_of_fleet(totals, fleet)) - set(names)
+    assert "moved_tasks" in of_fleets
+    assert sorted([*listed, "hottest_dc"]) == sorted([*keys, *names, *of_fleets])
     assert "`hottest_dc`" in text
     assert set(metrics["data_centers"][0]["metrics"]) == set(names) - {"hottest_dc"}

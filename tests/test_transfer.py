@@ -96,7 +96,8 @@ def test_a_site_sends_and_gets_at_most_what_its_link_carries() -> None:
     shares = [[0, 0.5, 0.5], [0, 0, 0.5], [0, 0, 0]]
     flow, sent, got, refused = flows(shares, [20, 10, 0], [99, 99, 99], of)
     # Site 0 asks for 20 and sends 3 + 3; site 2 is to get 3 + 5 and gets 6.
-    np.testing.assert_allclose(flow[0], [[0, 3, 2.25], [0, 0, 3.75], [0, 0, 0]], rtol=1e-12)
+    expected = [[0.0, 3.0, 2.25], [0.0, 0.0, 3.75], [0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(flow[0], expected, rtol=1e-12)
     np.testing.assert_allclose(refused, [14.75, 1.25, 0], rtol=1e-12)
     np.testing.assert_allclose(np.concatenate([sent, got]), [5.25, 3.75, 0, 0, 3, 6], rtol=1e-12)
 
@@ -199,6 +200,27 @@ def test_work_of_each_site_adds_up_with_what_it_sends_and_gets() -> None:
             went = r.executed_tasks + r.lost_tasks + r.dropped_tasks + r.queue_tasks
             np.testing.assert_allclose(came, went, rtol=1e-12)
             waited = r.queue_tasks
+
+
+def test_no_work_is_dropped_on_arrival() -> None:
+    config = with_values(fleet_of(delay_steps=4), {"workload.queue_limit_h": 0.5})
+    rng = np.random.default_rng(4)
+    arrived = refused = 0.0
+    fullest = np.zeros(4)
+    demand = np.repeat(rng.uniform(0.3, 1, (4, 75)), 4, axis=1)
+    drivers = drivers_from_arrays([20.0] * 300, [15.0] * 300, [300.0] * 300, demand)
+    with Simulator(config, drivers=drivers) as sim:
+        sim.reset()
+        for t in range(300):
+            shares = np.zeros((4, 4))
+            shares[:, t // 50 % 4] = 1.0
+            result = sim.step(Actions(transfer=shares, load=rng.choice([0.0, 0.5, 1.0], 4)))
+            assert not result.dropped_tasks.any(), t
+            fullest = np.maximum(fullest, result.queue_tasks)
+            arrived += result.landed_tasks.sum()
+            refused += result.refused_tasks.sum()
+    assert np.all(fullest > 150)
+    assert min(arrived, refused) > 3000
 
 
 def test_landed_work_keeps_its_deadline() -> None:

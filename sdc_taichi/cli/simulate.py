@@ -163,8 +163,9 @@ def simulate_command(
         str,
         controllers_option(
             "idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
-            "greedy-ci, mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
-            "load=greedy-ci,cooling=g36,battery=policy:runs/happo."
+            "greedy-ci, geo-central, geo-all-to-cleanest, geo-three-cleanest, geo-all-cleaner, "
+            "mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
+            "load=greedy-ci,cooling=g36,battery=policy:runs/happo; geo-... is for fleets."
         ),
     ] = "idle",
     run: ForecastRunOptions,

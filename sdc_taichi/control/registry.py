@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sdc_taichi.control.geo import Alone, Central, all_cleaner, all_to_cleanest, three_cleanest
 from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
     COMMANDS_OF_PART,
@@ -38,7 +39,10 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import check_code, import_path, imported, register_function
 
 CONTROLLABLE: tuple[Agent, ...] = AGENTS
-"""Valid parts of a controller spec such as ``load=NAME``, named like commands of ``Actions``."""
+"""Parts of a controller spec such as ``load=NAME`` that every data center has, named like commands
+of ``Actions``."""
+PARTS = (*CONTROLLABLE, "geo")
+"""All valid parts of a controller spec; ``geo`` sends work between the sites of a fleet."""
 ControllerMaker = Callable[[str, Fleet, tuple[str, ...]], Controller]
 """Function that makes a controller. Its arguments are the text after the colon of the controller's
 name, the data centers, and the parts of the spec that use this name."""
@@ -50,11 +54,11 @@ class _NamedController(NamedTuple):
     make: Callable[[], Controller]
     """Function that makes the controller."""
     parts: tuple[str, ...]
-    """Parts of a spec (from ``CONTROLLABLE``) for which the controller is valid."""
+    """Parts of a spec (from ``PARTS``) for which the controller is valid."""
 
 
 _CONTROLLERS: dict[str, _NamedController] = {
-    "idle": _NamedController(Idle, CONTROLLABLE),
+    "idle": _NamedController(Idle, PARTS),
     "random": _NamedController(Random, CONTROLLABLE),
     "g36": _NamedController(TrimAndRespond, ("cooling",)),
     "coldest": _NamedController(lambda: FixedSetpoint("low"), ("cooling",)),
@@ -62,6 +66,10 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "lookahead-3h": _NamedController(lambda: Lookahead(3.0), ("battery",)),
     "lookahead-24h": _NamedController(lambda: Lookahead(24.0), ("battery",)),
     "greedy-ci": _NamedController(GreedyCarbon, ("load", "battery")),
+    "geo-all-to-cleanest": _NamedController(lambda: Alone(all_to_cleanest), ("geo",)),
+    "geo-three-cleanest": _NamedController(lambda: Alone(three_cleanest), ("geo",)),
+    "geo-all-cleaner": _NamedController(lambda: Alone(all_cleaner), ("geo",)),
+    "geo-central": _NamedController(Central, ("geo",)),
 }
 _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
@@ -91,7 +99,7 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
         name: Identifier; a spec ``name:TEXT`` passes TEXT to the maker.
         maker: Function that returns the controller, class without constructor arguments, or import
             path ``module:name`` of either. A function is called with the text after the colon, the
-            fleet, and the parts of the spec (load, cooling, battery) that use the name.
+            fleet, and the parts of the spec (load, cooling, battery, geo) that use the name.
 
     Raises:
         ConfigError: The name is taken, or ``maker`` is neither a function nor a class.
@@ -135,9 +143,9 @@ def make_controller(spec: str | Controller, fleet: Fleet, *, allow_code: bool = 
     controllers: dict[str, Controller] = {}
     for name in dict.fromkeys(named.values()):
         # Parts with the same name share one controller, so that a plan covers them together.
-        parts = tuple(part for part in CONTROLLABLE if named.get(part) == name)
+        parts = tuple(part for part in PARTS if named.get(part) == name)
         controllers |= dict.fromkeys(parts, _make(name, fleet, parts, allow_code))
-    return PerAgent(*(controllers.get(part, Idle()) for part in CONTROLLABLE))
+    return PerAgent(*(controllers.get(part, Idle()) for part in PARTS))
 
 
 def parts_of(spec: str) -> dict[str, str]:
@@ -154,10 +162,10 @@ def parts_of(spec: str) -> dict[str, str]:
     named: dict[str, str] = {}
     for part in spec.split(","):
         agent, sign, name = (text.strip() for text in part.partition("="))
-        if not sign or agent not in CONTROLLABLE:
+        if not sign or agent not in PARTS:
             raise ConfigError(
                 f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
-                f"agents {', '.join(CONTROLLABLE)}{suggestion(agent, CONTROLLABLE, _SUGGESTION)}"
+                f"agents {', '.join(PARTS)}{suggestion(agent, PARTS, _SUGGESTION)}"
             )
         if agent in named:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice; valid is each once")
@@ -213,12 +221,13 @@ def _copy(given: Any) -> Controller:
         ) from None
 
 
-def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, allow_code: bool) -> Controller:
+def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bool) -> Controller:
     """Make a controller by name, for the ``parts`` of a spec; None stands for a plain name."""
-    if is_mpc(name):
-        return model_predictive(name, parts or CONTROLLABLE)
     kind, colon, text = name.partition(":")
-    if kind == "constant":
+    if is_mpc(name):
+        agents = tuple(a for a in CONTROLLABLE if parts is None or a in parts)
+        entry = _NamedController(lambda: model_predictive(name, agents), CONTROLLABLE)
+    elif kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
     elif name in _CONTROLLERS:
         entry = _CONTROLLERS[name]
@@ -227,20 +236,25 @@ def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, allow_code: 
     agent = _first_missing(parts, entry.parts)
     if agent is not None:
         able = [n for n, e in _CONTROLLERS.items() if agent in e.parts]
-        able += [_CONSTANT, _MPC, _POLICY] if agent == "cooling" else [_MPC, _POLICY]
+        able += {"cooling": [_CONSTANT, _MPC, _POLICY], "geo": []}.get(agent, [_MPC, _POLICY])
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
+        )
+    if entry.parts == ("geo",) and fleet.sites_per_fleet == 1:
+        raise ConfigError(
+            f"controller {name!r}: the data centers share no work; valid with a config that has "
+            "section fleet, such as preset fleet_of_eight"
         )
     return entry.make()
 
 
-def _first_missing(parts: tuple[Agent, ...] | None, valid: Sequence[str]) -> Agent | None:
+def _first_missing(parts: tuple[str, ...] | None, valid: Sequence[str]) -> str | None:
     """Return the first of ``parts`` that is not in ``valid``, or None."""
     return next((part for part in parts or () if part not in valid), None)
 
 
 def _made_by_maker(
-    name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, allow_code: bool
+    name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bool
 ) -> Controller:
     """Make a controller with a registered maker, or with one whose import path is ``name``."""
     kind, _, text = name.partition(":")
@@ -277,7 +291,8 @@ def _made_by_maker(
         made = maker(text, fleet, parts or CONTROLLABLE)
     controller = check_controller(made, f"controller {name!r}")
     commands = commands_of(controller)
-    agent = _first_missing(parts, commands)
+    acts_on = [*commands, *(["geo"] if "transfer" in commands else [])]
+    agent = _first_missing(parts, acts_on)
     if agent is not None:
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; it gives "

@@ -28,6 +28,7 @@ COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "load": ("load", "placement"),
     "cooling": ("cooling", "fan", "placement", "chilled_water"),
     "battery": ("battery",),
+    "geo": ("transfer",),
 }
 """Fields of ``Actions`` that each part of ``PerAgent`` may give."""
 _DRAWN_STEPS = 256
@@ -222,7 +223,7 @@ class GreedyCarbon(_WithoutMemory):
 
 
 class PerAgent:
-    """Combination of one controller each for load, cooling and battery.
+    """Combination of one controller each for load, cooling, battery, and transfers.
 
     A controller that is used for several of them acts only once per step.
 
@@ -231,6 +232,7 @@ class PerAgent:
         cooling: Controller of the setpoint command, and of fan speeds and placement if it gives
             them.
         battery: Controller of the battery command.
+        geo: Controller of the transfers between sites of a fleet; None sends nothing.
 
     Attributes:
         commands: Fields of ``Actions`` that the controllers give.
@@ -239,8 +241,14 @@ class PerAgent:
         ConfigError: The load controller and the cooling controller both place work.
     """
 
-    def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
-        parts = {"load": load, "cooling": cooling, "battery": battery}
+    def __init__(
+        self,
+        load: Controller,
+        cooling: Controller,
+        battery: Controller,
+        geo: Controller | None = None,
+    ) -> None:
+        parts = {"load": load, "cooling": cooling, "battery": battery, "geo": geo or Idle()}
         self._giver: dict[str, Controller] = {}
         for part, controller in parts.items():
             for command in COMMANDS_OF_PART[part]:

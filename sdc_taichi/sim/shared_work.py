@@ -42,7 +42,8 @@ class SharedWork:
     def fleet_sums(self, values: F64) -> F64:
         """Return the sum over its fleet for each site, (B,), of values of the sites, (B,)."""
         sites = self.allowed.shape[1]
-        return np.asarray(np.repeat(values.reshape(-1, sites).sum(axis=1), sites))
+        sums: F64 = np.repeat(values.reshape(-1, sites).sum(axis=1), sites)
+        return sums
 
     def excess(self, values: F64, budget: F64) -> F64:
         """Return each site's part of its fleet's excess over a budget, (B,), by its share.
@@ -59,7 +60,7 @@ class SharedWork:
     def link_tasks(self) -> F64:
         """Most work that each site can send in a step, in tasks, inf for no limit, (B,)."""
         pairs = np.where(self.allowed > 0.0, self.pair_tasks, 0.0).sum(axis=1)
-        return np.minimum(self.site_tasks, pairs)
+        return np.asarray(np.minimum(self.site_tasks, pairs))
 
 
 def shared_work(configs: Sequence[DataCenterConfig]) -> SharedWork | None:

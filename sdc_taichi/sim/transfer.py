@@ -94,9 +94,10 @@ class Flows:
 class Transfer:
     """Moves flexible work between the sites of each fleet.
 
-    A site can take work up to the room M = queue limit + capacity - queue - work on its way to it,
-    so that nothing is dropped on arrival unless the site fills its queue with work of its own in
-    the meantime. In a batch of data centers that run alone nothing moves.
+    A site can take work up to the room M = queue limit - queue - work on its way to it + the part
+    of the work that arrives in the step for which it has capacity beside its own work. Since own
+    work does not exceed capacity, nothing is then dropped on arrival, unless a site loses capacity
+    or fills its queue on command. In a batch of data centers that run alone nothing moves.
 
     Args:
         fleet: B data centers.
@@ -141,8 +142,10 @@ class Transfer:
         in_flight = state.in_flight
         if shares is not None:
             capacity = np.minimum(self._max_utilisation, max_utilisation) * TASKS_PER_STEP
-            room = self._queue_limit + capacity - state.queue[:, -1] - in_flight.sum(axis=1)
-            flexible = self._flexible_share * (demand * TASKS_PER_STEP)
+            own = demand * TASKS_PER_STEP
+            runs = np.minimum(in_flight[:, 0], np.maximum(capacity - own, 0.0))
+            room = self._queue_limit - state.queue[:, -1] - in_flight.sum(axis=1) + runs
+            flexible = self._flexible_share * own
             sent, got, refused = self._flows.of(shares, flexible, np.maximum(room, 0.0))
             kwh = 0.5 * self.kwh_per_task * (sent + got)
             carbon_g = kwh * ci_g_per_kwh
@@ -157,16 +160,21 @@ class Transfer:
             self._flows.release()
 
 
-def transfer_kwh_per_task(fleet: Fleet, sizing: Sizing) -> F64:
-    """Return the energy of a transfer, in kWh per task, (B,), equal at all sites of a fleet.
+def task_kwh(fleet: Fleet, sizing: Sizing) -> F64:
+    """Return the facility energy of a task, in kWh, (B,), as the mean of the sites of a fleet.
 
-    The energy of a task in the servers is 1 % of the difference of their full and idle power during
-    a step; that in the facility includes the PUE of the design point.
+    The servers need 1 % of the difference of their full and idle power during a step, and the
+    facility this energy times the PUE of the design point.
     """
     step_h = 1.0 / fleet.steps_per_hour
     servers_w = np.array([count @ (full - idle) for count, full, idle, *_ in fleet.group_rows])
-    task_kwh = servers_w * (sizing.facility_w / sizing.it_w) * (step_h / 1e3 / TASKS_PER_STEP)
-    kwh = fleet.values("fleet.transfer_kwh_per_task")
-    kwh = np.where(np.isnan(kwh), fleet.values("fleet.transfer_energy_ratio") * task_kwh, kwh)
+    kwh = servers_w * (sizing.facility_w / sizing.it_w) * (step_h / 1e3 / TASKS_PER_STEP)
     sites = fleet.sites_per_fleet
     return np.repeat(kwh.reshape(-1, sites).mean(axis=1), sites)
+
+
+def transfer_kwh_per_task(fleet: Fleet, sizing: Sizing) -> F64:
+    """Return the energy of a transfer, in kWh per task, (B,), equal at all sites of a fleet."""
+    kwh = fleet.values("fleet.transfer_kwh_per_task")
+    by_ratio = fleet.values("fleet.transfer_energy_ratio") * task_kwh(fleet, sizing)
+    return np.where(np.isnan(kwh), by_ratio, kwh)
