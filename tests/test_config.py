@@ -28,7 +28,10 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.schema import BatteryConfig
 
-PRESETS = ("corrected", "fleet_of_eight", "hall_of_2026", "large", "paper", "sustaindc", "tiny")
+PRESETS = (
+    "corrected", "fleet_of_eight", "hall_agents_6", "hall_of_2026", "large", "paper", "sustaindc",
+    "tiny",
+)  # fmt: skip
 
 
 def written(path: Path, text: str) -> Path:

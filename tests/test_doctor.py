@@ -101,7 +101,7 @@ def completed(*words: str) -> list[str]:
         (["data", "show", "N"], ["NY"]),
         (["train", "had"], ["had3qn"]),
         (["benchmark", "run", "carbon-"], ["carbon-rich"]),
-        (["new", "mine.yaml", "--from", "hall_"], ["hall_of_2026"]),
+        (["new", "mine.yaml", "--from", "hall_o"], ["hall_of_2026"]),
         (["simulate", "my_own"], []),
     ],
 )

@@ -158,6 +158,10 @@ def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_lim
 def test_every_preset_has_an_optimum(preset: str) -> None:
     if preset == "large":
         pytest.skip("of the same models as corrected")
+    if preset.startswith("hall_agents"):
+        with pytest.raises(ConfigError, match="zone_loads: plans need the work of a trace"):
+            solved(config_of("CA", preset=preset), steps=24)
+        return
     found = solved(config_of("CA", preset=preset), steps=24)
     assert found.achieved[0] <= found.idle[0]
     assert not found.bound[0] > found.achieved[0]

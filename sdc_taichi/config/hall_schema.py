@@ -335,6 +335,10 @@ class HallConfig(Section):
     velocity."""
     recirculation: RecirculationConfig = RecirculationConfig()
     """Recirculation of exhaust air, for inlet model ``recirculation``."""
+    sensor_error_k: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Largest error of the inlet temperatures that a CRAC unit measures, in K, 0..10: that of each
+    unit and run is uniformly distributed between its negative and itself. It affects controllers
+    that read the zones of the units, not the air."""
     height_zones: Annotated[int, Field(ge=1, le=100)] = 5
     """Number of zones over the height of a rack, each with its own inlet temperature, for inlet
     model ``recirculation``, 1..100; the tallest racks have 58 units."""

@@ -106,6 +106,52 @@ class BatteryConfig(Section):
         return self
 
 
+class ZoneLoadsConfig(Section):
+    """Loads of the zones of a hall: blocks of its rows and of the places in these rows.
+
+    The load of a zone is an Ornstein-Uhlenbeck process around a mean that is drawn for each run,
+    clipped to its limits. Zones are numbered from the first row, and in it from the first place.
+    """
+
+    row_blocks: Annotated[int, Field(ge=1, le=1000)] = 2
+    """Number of blocks into which the rows are divided, of equal size up to one row, 1..1,000."""
+    place_blocks: Annotated[int, Field(ge=1, le=1000)] = 2
+    """Number of blocks into which the places of a row are divided, of equal size up to one place,
+    1..1,000."""
+    low: WorkingShare = 0.1
+    """Lowest load, 0.01..1."""
+    high: WorkingShare = 1.0
+    """Highest load, 0.01..1."""
+    mean: tuple[WorkingShare, WorkingShare] = (0.3, 0.9)
+    """Range of the means: that of each zone and run is uniformly distributed in it."""
+    deviation: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """Standard deviation of a load from its mean before it is clipped, 0..1."""
+    reversion_h: Hours = 2.0
+    """Time in which the correlation of a load with its present value falls to 1/e, in h."""
+    fixed: tuple[WorkingShare, ...] | None = None
+    """Constant load of each zone, in place of the process, 0.01..1; None means the process."""
+
+    @property
+    def zones(self) -> int:
+        """Number of zones."""
+        return self.row_blocks * self.place_blocks
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        low, high = self.mean
+        if not self.low <= low <= high <= self.high:
+            raise ValueError(
+                f"mean ({low:g}, {high:g}) with low {self.low:g} and high {self.high:g}: valid is "
+                "low <= mean.0 <= mean.1 <= high"
+            )
+        if self.fixed is not None and len(self.fixed) != self.zones:
+            raise ValueError(
+                f"fixed has {len(self.fixed)} loads; valid is {self.zones}, row_blocks "
+                f"{self.row_blocks} x place_blocks {self.place_blocks}"
+            )
+        return self
+
+
 class WorkloadConfig(Section):
     """Delay-tolerant work: its share, queue and deadline (1 task = 1 % of capacity for a step)."""
 
@@ -114,6 +160,10 @@ class WorkloadConfig(Section):
     counts them."""
     trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
+    zone_loads: ZoneLoadsConfig | None = None
+    """Loads of the zones of the hall, which replace the arriving work of ``trace`` and, without an
+    action for placement, its distribution over the racks; they need placement ``weights``. None
+    means the work of ``trace``."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
     """Policy that distributes the work of a step over the racks."""
     flexible_share: Share = 0.2
@@ -135,6 +185,15 @@ class WorkloadConfig(Section):
             raise ValueError(
                 f"deadline_h {self.deadline_h:g} must not exceed "
                 f"age_horizon_h {self.age_horizon_h:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _zones_place_the_work(self) -> Self:
+        if self.zone_loads is not None and self.placement != "weights":
+            raise ValueError(
+                f"zone_loads with placement {self.placement}: valid is placement weights, by which "
+                "each rack runs at the load of its zone"
             )
         return self
 
@@ -294,6 +353,19 @@ class DataCenterConfig(Section):
                 raise ValueError(
                     f"hvac.crac.unit_shares of rack {rack}: {len(shares)} entries that sum to "
                     f"{sum(shares):g}; valid is {crac.units} (hvac.crac.units) that sum to 1"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _zones_fit_the_hall(self) -> Self:
+        zones, hall = self.workload.zone_loads, self.hall
+        blocks = () if zones is None else (zones.row_blocks, zones.place_blocks)
+        names = (("row_blocks", "rows"), ("place_blocks", "racks_per_row"))
+        for (block, name), count in zip(names, blocks, strict=False):
+            if count > getattr(hall, name):
+                raise ValueError(
+                    f"workload.zone_loads.{block} {count}: valid is 1..{getattr(hall, name)}, "
+                    f"hall.{name}"
                 )
         return self
 

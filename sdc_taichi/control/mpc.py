@@ -173,8 +173,9 @@ class _Planners:
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.plans import QueuePlanner, StorePlanner
         from sdc_taichi.optimum.facility_map import facility_map
-        from sdc_taichi.optimum.problem import inlet_limits_c
+        from sdc_taichi.optimum.problem import inlet_limits_c, require_traces
 
+        require_traces(view.fleet)
         self._sizing, self._drivers = view.sizing, view.drivers
         self.facility = facility_map(
             view.fleet,

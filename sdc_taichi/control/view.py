@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from sdc_taichi.control.unit_zones import UnitZones, ZoneReadings
 from sdc_taichi.errors import ConfigError, RuntimeStateError, suggestion
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.number_text import parse_number
@@ -26,6 +27,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
+from sdc_taichi.sim.zone_loads import RackLoads, ZoneLoads
 from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
 
 MOST_CI_SHARE = 10.0
@@ -242,6 +244,14 @@ class View:
     """Length of a step, in h."""
     precision: Precision
     """Floating-point precision of the hall kernels: ``f32`` or ``f64``."""
+    zones: UnitZones
+    """Zones of the CRAC units, shared by all views of an episode."""
+    zone_supply_ratio: F64
+    """Supply air of each CRAC unit divided by what the racks need of it, 0..10, (U,), at the end of
+    the last step: the pressure before its tiles as a multiple of that which just meets the need. 1
+    before the first step."""
+    zone_loads: ZoneLoads | None
+    """Loads of the zones of halls, see ``workload.zone_loads``; None without any."""
     forecast_error: ForecastError = PERFECT
     """Standard deviations of the forecast errors."""
     walks: RandomWalks | None = None
@@ -251,7 +261,45 @@ class View:
     @property
     def now(self) -> Exogenous:
         """Inputs of the next step, each (B,)."""
-        return self.drivers.at(self.state.step)
+        exogenous = self.drivers.at(self.state.step)
+        if self.zone_loads is None:
+            return exogenous
+        return replace(exogenous, demand=self._loads(self.zone_loads, exogenous).demand)
+
+    @property
+    def rack_load(self) -> F64:
+        """Arriving work of each rack in the next step as a share of its capacity, 0..1, (R,)."""
+        exogenous = self.drivers.at(self.state.step)
+        if self.zone_loads is None:
+            return exogenous.demand[self.fleet.rack_dc]
+        return self._loads(self.zone_loads, exogenous).rack_load
+
+    def _loads(self, zone_loads: ZoneLoads, exogenous: Exogenous) -> RackLoads:
+        return zone_loads.at(self.state.step, exogenous.demand)
+
+    @property
+    def zone_hottest_c(self) -> F64:
+        """Hottest server inlet of each CRAC unit's zone as its sensors measure it, in C, (U,)."""
+        return self._zone_readings.hottest_c
+
+    @property
+    def zone_mean_c(self) -> F64:
+        """Mean rack inlet of each CRAC unit's zone as its sensors measure it, in C, (U,)."""
+        return self._zone_readings.mean_c
+
+    @property
+    def zone_hottest_true_c(self) -> F64:
+        """Hottest server inlet of each CRAC unit's zone, in C, (U,)."""
+        return self._zone_readings.hottest_true_c
+
+    @property
+    def unit_running(self) -> F64:
+        """1 for CRAC units that ran in the last step, 0 for units that were down, (U,)."""
+        return self._zone_readings.unit_running
+
+    @property
+    def _zone_readings(self) -> ZoneReadings:
+        return self.zones.readings(self.last, self.state.setpoint_c, self.state.seed)
 
     def forecast(self, hours: float) -> Forecast:
         """Return a forecast of the coming hours, with the errors of ``forecast_error``.
@@ -327,6 +375,7 @@ def view_maker(
     step_h = sim.step_h
     limits, sizing = limits_of(sim.fleet), sim.sizing
     walks: RandomWalks | None = None
+    zones, even = UnitZones(sim.fleet), np.ones(sim.fleet.units)
     if forecast_error != PERFECT:
         seeds = walk_keys(sim.state.seed, sim.fleet.names) if keys is None else keys
         walks = RandomWalks(seeds, step_h)
@@ -341,6 +390,9 @@ def view_maker(
             limits,
             step_h,
             sim.precision,
+            zones,
+            even if last is None else sim.supply_ratio(),
+            sim.zone_loads,
             forecast_error,
             walks,
         )

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.tables import FacilityTable
@@ -180,6 +180,19 @@ class Problem:
     def steps(self) -> int:
         """Number of steps, T."""
         return len(self.kwh_weight)
+
+
+def require_traces(fleet: Fleet) -> None:
+    """Check that the arriving work of every data center is that of a trace, which plans need.
+
+    Raises:
+        ConfigError: A data center has loads by zone.
+    """
+    for config in fleet.configs:
+        if config.workload.zone_loads is not None:
+            raise ConfigError(
+                f"{config.name}: workload.zone_loads: plans need the work of a trace; valid is null"
+            )
 
 
 def problems_of(

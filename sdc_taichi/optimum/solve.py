@@ -28,6 +28,7 @@ from sdc_taichi.optimum.problem import (
     StoppedError,
     forced_discharge_reason,
     no_table_reasons,
+    require_traces,
     uncooled_reason,
 )
 from sdc_taichi.optimum.result import BoundOfEnds, Optimum
@@ -129,6 +130,7 @@ def solve(
         )
     if precision not in ("f32", "f64"):
         raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
+    require_traces(fleet)
     inputs = load_drivers(fleet.configs) if drivers is None else drivers
     if inputs.size != fleet.size:
         raise ConfigError(f"drivers of {inputs.size} data centers for a fleet of {fleet.size}")

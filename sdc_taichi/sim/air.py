@@ -62,12 +62,13 @@ class SteadyAir:
         self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
         self._no_memory = dict.fromkeys(_HALL_FIELDS, _EMPTY)
 
-    def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
+    def initial(self, supply: Supply, demand: F64, rack_load: F64 | None) -> dict[str, Any]:
         """Return the temperatures before the first step, by their field names in ``State``.
 
         Args:
             supply: Operation of the CRAC units.
             demand: Running work as a share of capacity, 0..1, (B,).
+            rack_load: Load of each rack, 0..1, (R,); None loads racks evenly.
         """
         return {**self._no_memory, "group_inlet_c": self._inlets.initial()}
 
@@ -123,12 +124,13 @@ class TransientAir:
         self._unit_sums, self._unit_m3s = fleet.unit_sums, fleet.unit_design_m3s
         self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
 
-    def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
-        """Return the steady temperatures at ``demand``; arguments as in ``SteadyAir.initial``."""
+    def initial(self, supply: Supply, demand: F64, rack_load: F64 | None) -> dict[str, Any]:
+        """Return the steady temperatures at a load; arguments as in ``SteadyAir.initial``."""
         steady = self._hall.steady_state(
             Conditions(
                 unit_supply_c=supply.coldest_supply_c,
                 utilisation=demand,
+                rack_load=rack_load,
                 unit_low=supply.unit_low,
                 unit_high=supply.unit_high,
             )

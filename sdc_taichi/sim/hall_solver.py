@@ -511,6 +511,17 @@ class Hall:
             }
         )
 
+    def supply_ratio(self) -> F64:
+        """Return the supply air of each unit divided by the need of it; see ``Simulator``."""
+        if not self._recirculates:
+            return np.ones(self._fleet.units)
+        unit = self._unit_state
+        need_m3s, fresh_m3s = unit["plain_m3s"], self._fresh_m3s * unit["speed"]
+        # Air beyond the limits of numbers, which is NaN, gives the upper bound.
+        is_below = fresh_m3s < MOST_SUPPLY_RATIO * need_m3s
+        ratio = np.full(len(need_m3s), MOST_SUPPLY_RATIO)
+        return np.asarray(np.divide(fresh_m3s, need_m3s, out=ratio, where=is_below))
+
     def discard_last_step(self) -> None:
         """Forget the last step, so that ``servers`` cannot return layers of an outdated state."""
         self._was_transient = None

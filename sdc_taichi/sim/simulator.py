@@ -32,7 +32,8 @@ from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.transfer import TransferResult
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
-from sdc_taichi.types import I32, I64, Actions, ServerLayers, State, StepResult, joined
+from sdc_taichi.sim.zone_loads import with_loads, zone_loads
+from sdc_taichi.types import F64, I32, I64, Actions, ServerLayers, State, StepResult, joined
 
 
 class Simulator:
@@ -84,6 +85,8 @@ class Simulator:
             steps_per_hour=self.fleet.steps_per_hour,
             seed=0,
         )
+        self.zone_loads = zone_loads(self.fleet, np.zeros(self.fleet.size, dtype=np.int64))
+        """Loads of the zones of the halls; None if no data center has ``workload.zone_loads``."""
         self._stages: Stages | None = None
         self._state: State | None = None
         # State before the first step of the run; None if it has to be computed.
@@ -174,7 +177,12 @@ class Simulator:
 
     def _initial_state(self, seeds: I64, drivers: Drivers) -> State:
         """Return the state before the first step; see ``reset``."""
-        return self._started().initial_state(self.fleet, seeds, drivers)
+        demand = drivers.at(0).demand
+        loads = None
+        if self.zone_loads is not None:
+            self.zone_loads.reseed(seeds)
+            loads = self.zone_loads.at(0, demand)
+        return self._started().initial_state(self.fleet, seeds, drivers, loads)
 
     def step(self, actions: Actions | None = None) -> StepResult:
         """Advance all data centers by one step.
@@ -193,6 +201,9 @@ class Simulator:
         runtime.ensure_started()
         commands = stages.decoder.decode(actions)
         exogenous = self.drivers.at(state.step)
+        if self.zone_loads is not None:
+            loads = self.zone_loads.at(state.step, exogenous.demand)
+            exogenous, commands = with_loads(loads, self.fleet, exogenous, commands)
         event = self._timeline.at(state.step)
         surroundings = stages.surroundings.at(exogenous, event, state.stored_kwh)
         capacity = stages.allocation.capacity(state, commands, surroundings)
@@ -278,6 +289,14 @@ class Simulator:
     def sweeps(self) -> I32:
         """Sweeps, or substeps of transient halls, of each data center in the last step, (B,)."""
         return self._started().hall.sweeps
+
+    def supply_ratio(self) -> F64:
+        """Return the supply air of each CRAC unit divided by the racks' need of it, 0..10, (U,).
+
+        Need is that at the exhaust shares of the design point, at the end of the last step; the
+        result is 1 without recirculation.
+        """
+        return self._started().hall.supply_ratio()
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
         """Return inlet, outlet and power of every server in the last step, (S,) each.
@@ -382,6 +401,8 @@ class Simulator:
         self._last_air = self._beyond = self._first_state = None
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
+        if self.zone_loads is not None:
+            self.zone_loads.reseed(state.seed)
         self._drivers = replace(inputs, start=state.start)
 
     def restart(self, chosen: npt.NDArray[np.bool_]) -> None:

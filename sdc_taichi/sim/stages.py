@@ -24,6 +24,7 @@ from sdc_taichi.sim.step_inputs import ActionDecoder, SurroundingsModel, UnitInd
 from sdc_taichi.sim.transfer import Transfer
 from sdc_taichi.sim.work_allocation import WorkAllocation
 from sdc_taichi.sim.workload import Workload
+from sdc_taichi.sim.zone_loads import RackLoads
 from sdc_taichi.types import F64, I64, State
 
 
@@ -52,15 +53,21 @@ class Stages:
     facility: FacilityStage
     """Models of plant, water, battery, grid and carbon."""
 
-    def initial_state(self, fleet: Fleet, seeds: I64, drivers: Drivers) -> State:
+    def initial_state(
+        self, fleet: Fleet, seeds: I64, drivers: Drivers, loads: RackLoads | None = None
+    ) -> State:
         """Return the state before the first step.
 
         Args:
             fleet: The B data centers for which the stages were made.
             seeds: Seed of the sampled events of each data center, (B,).
             drivers: Inputs, which define the first step of the run.
+            loads: Loads of the racks in the first step; None loads them evenly by ``drivers``.
         """
         supply = self.crac_units.initial_supply()
+        demand, rack_load = drivers.at(0).demand, None
+        if loads is not None:
+            demand, rack_load = loads.demand, loads.rack_load
         return State(
             step=0,
             seed=seeds,
@@ -75,7 +82,7 @@ class Stages:
             room_heat_kwh=np.zeros(fleet.size),
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
             restart_wait_min=self.allocation.initial_wait_min(),
-            **self.air.initial(supply, drivers.at(0).demand),
+            **self.air.initial(supply, demand, rack_load),
         )
 
 
