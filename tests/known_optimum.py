@@ -49,6 +49,7 @@ def made_up_optimum(
         bound=0.9 * best.figure,
         achieved=best.figure,
         alone={"cooling": 0.5 * (idle.figure + best.figure)},
+        uncoordinated={},
         bound_kinds=kinds,
         failures=((), *[("facility energy off by 1e-3",)] * (sim.size - 1)),
         certificates=tuple(

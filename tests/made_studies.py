@@ -79,8 +79,9 @@ def frame_of(
 def frames_of_row(name: str, seed: int) -> pd.DataFrame:
     """Rows of a result of the made-up suite."""
     if name == "optimum":
-        alone = [frame_of(0.04, agent, figures_alone=True) for agent in ("load", "battery")]
-        return pd.concat([frame_of(0.1), *alone], ignore_index=True)
+        beside = {"load": 0.04, "battery": 0.04, "together": 0.06, "in_turn": 0.09}
+        others = [frame_of(x, moves, figures_alone=True) for moves, x in beside.items()]
+        return pd.concat([frame_of(0.1), *others], ignore_index=True)
     if name == "bound":
         return frame_of(0.11, figures_alone=True)
     wiggle = 0.002 * np.sin(np.arange(len(IDLE)) + seed) * (name not in ("idle", "coldest"))

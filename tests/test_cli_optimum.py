@@ -17,6 +17,7 @@ from sdc_taichi import Fleet, Simulator
 from sdc_taichi.cli.app import app
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.result import Optimum
+from sdc_taichi.optimum.uncoordinated import WAYS
 from sdc_taichi.run.folder_reader import read_run
 
 CASE = ("tiny", "--site", "ny,ca", "--days", "1", "--start", "07-01")
@@ -111,6 +112,7 @@ def test_simulate_tells_its_share(asked: dict[str, Any], tmp_path: Path) -> None
         (["--objective", "carbn"], "did you mean 'carbon'"),
         (["--objective", "-1*carbon"], "weight -1 of carbon"),
         (["--agents", "load,cool"], "--agents 'load,cool': 'cool'; valid are load, cooling"),
+        (["--agents", "load", "--uncoordinated"], "valid is with two or more agents"),
         (["--agents", "load,load"], "load is given twice"),
         (["--warm-up", "1"], "--warm-up 1: valid is less than --days"),
         (["--warm-up", "0.001"], "--warm-up 0.001: valid is a positive number of days"),
@@ -175,7 +177,7 @@ def test_interrupted_controllers_leave_the_figures(
 def test_solved_figures_are_in_order(tmp_path: Path) -> None:
     out = tmp_path / "best"
     done = call("optimum", *CASE, "--days", "0.5", "--no-cache", "--controller", "idle",
-                "--controller", "g36", "--json", "--out", out)  # fmt: skip
+                "--controller", "g36", "--uncoordinated", "--json", "--out", out)  # fmt: skip
     assert done.exit_code == 0, done.output
     content = json.loads(done.stdout)
     idle, g36 = content["controllers"]
@@ -188,5 +190,7 @@ def test_solved_figures_are_in_order(tmp_path: Path) -> None:
         assert at_rest["share"] == 0.0
         assert rule["share"] < 1.0
         assert min(dc["alone"].values()) >= dc["achieved"] * (1.0 - 1e-9)
+        assert tuple(dc["uncoordinated"]) == WAYS
+        assert min(dc["uncoordinated"].values()) >= dc["bound"]
     cfp = [dc["metrics"]["cfp_kg"] for dc in read_run(out).metrics["data_centers"]]
     assert cfp == pytest.approx([dc["achieved"] for dc in content["data_centers"]], rel=1e-9)

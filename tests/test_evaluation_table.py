@@ -57,6 +57,7 @@ def found() -> Evaluation:
         rows=pd.concat(every, ignore_index=True),
         objective=Objective(carbon=1.0),
         alone={"load": 0.99 * IDLE, "battery": 0.96 * IDLE},
+        uncoordinated={},
         strata=np.array([0, 0, 1, 1]),
         missing=(),
     )
@@ -108,13 +109,13 @@ def test_differences_are_paired(found: Evaluation) -> None:
 def test_of_a_bound_its_figure_alone_is_known(found: Evaluation) -> None:
     is_bound = found.rows["controller"] == "g36"
     rows = found.rows.assign(cfp_kg=found.rows["cfp_kg"].mask(is_bound))
-    table = summary(Evaluation(rows, found.objective, {}, found.strata, ()))
+    table = summary(Evaluation(rows, found.objective, {}, {}, found.strata, ()))
     assert table["broken_pct"].isna().tolist() == [name == "g36" for name in table["controller"]]
 
 
 def test_without_an_optimum_figures_are_compared_as_they_are(found: Evaluation) -> None:
     without = found.rows.assign(valued_figure=np.nan, achieved_figure=np.nan, broken=None)
-    table = summary(Evaluation(without, found.objective, {}, found.strata, ()))
+    table = summary(Evaluation(without, found.objective, {}, {}, found.strata, ()))
     assert table["change_pct"].tolist() == pytest.approx([2.0, -3.0, 0.0])
     assert table["share_pct"].isna().all()
     assert table["broken_pct"].isna().all()

@@ -95,6 +95,9 @@ def test_figures_of_the_tables(board: Leaderboard) -> None:
     together = by_row(board.coordination)
     assert together["ippo"]["parts_pct"] == pytest.approx(-2.0)
     assert together["optimum"]["worth_points"] == pytest.approx(2.0)
+    assert together["optimum"]["together"] == pytest.approx(-6.0)
+    assert together["optimum"]["in_turn"] == pytest.approx(-9.0)
+    assert np.isnan(together["ippo"]["in_turn"])
 
 
 def test_constraints_have_a_column_where_one_is_broken(board: Leaderboard, tmp_path: Path) -> None:

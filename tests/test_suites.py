@@ -26,6 +26,8 @@ from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs, run_suite, 
 from sdc_taichi.cli.app import app
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.policy import About, Policy
+from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.uncoordinated import WAYS
 
 SMALL: dict[str, Any] = {
     "name": "small",
@@ -257,7 +259,7 @@ def test_rows_stand_between_idle_commands_and_the_bound(store: ResultStore) -> N
     assert scored["share"]["idle"] == 0.0
     assert scored["share"]["optimum"] == pytest.approx(1.0)
     assert scored["share"]["bound"] >= 1.0 - 1e-9
-    assert set(rows["moves"]["optimum"]) == {"all", "load", "cooling", "battery"}
+    assert set(rows["moves"]["optimum"]) == {"all", *AGENTS, *WAYS}
     assert rows["seed"]["random"].tolist() == [0, 1]
     assert rows["figure"]["random"].nunique() == 2
     partition = {"suite": "small", "case": "tiny", "row": "best-constant", "seed": "0"}

@@ -45,6 +45,7 @@ from sdc_taichi.learning.statistics import (
     sample_mean,
 )
 from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.uncoordinated import WAYS, title_of
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ BOARD_TITLES = {
     "together_pct": "together (%)",
     "worth_points": "coordination (points)",
     **{agent: f"{agent} alone (%)" for agent in ("load", "cooling", "battery")},
+    **{way: f"{title_of(way)} (%)" for way in WAYS},
     **{f"above_{x:g}_pct": f"above {x:g} % (%)" for x in THRESHOLDS_PCT},
 }
 """Titles of columns in tables of this module."""
@@ -103,8 +105,8 @@ class Leaderboard:
     """Share of weeks, in %, in which a row exceeds thresholds of the share of the achievable
     saving; empty without an optimum."""
     coordination: pd.DataFrame
-    """Savings of each agent of a row alone, and of all agents together; empty if no agent ran
-    alone."""
+    """Savings of each agent of a row alone, of all agents together and, for the optimum, of agents
+    that do not plan together; empty if no agent ran alone."""
     apart: pd.DataFrame
     """Comparison of rows whose agents were trained together with rows whose agents were trained
     separately."""
@@ -315,8 +317,10 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
     for name, (all_together, idle) in figures.items():
         if case.kinds[name] == ACHIEVED:
             alone = {agent: best[None] for agent, best in evaluation.alone.items()}
+            ways = {way: best[None] for way, best in evaluation.uncoordinated.items()}
         else:
             alone = {agent: figure[name][0] for agent, figure in by_agent.items() if name in figure}
+            ways = {}
         changes = {agent: float(change_pct(figure, idle)) for agent, figure in alone.items()}
         if not changes:
             continue
@@ -325,6 +329,7 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
             {"row": name}
             | {agent: changes.get(agent, math.nan) for agent in AGENTS}
             | {"parts_pct": parts, "together_pct": together, "worth_points": parts - together}
+            | {way: float(change_pct(figure, idle)) for way, figure in ways.items()}
         )
     return pd.DataFrame(table)
 

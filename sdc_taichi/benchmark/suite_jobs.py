@@ -59,6 +59,8 @@ _SECONDS = "seconds"
 def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
     """Compute the optima of a site's weeks, and the value of energy and work left at their ends.
 
+    In held-out weeks, agents that do not plan together are solved for as well.
+
     Args:
         values: ``case``, ``part``, index of the ``site``, and ``objective``.
 
@@ -74,6 +76,7 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
             [config],
             weeks_of(case, part),
             objective=values["objective"],
+            uncoordinated=part == "held-out",
             days=case.days,
             cache=folder,
         ) as weeks,
@@ -298,6 +301,7 @@ def _weeks(
         weeks_of(task.case, part),
         objective=task.objective,
         optimum=task.case.optimum,
+        uncoordinated=part == "held-out" and task.row.optimum == "achieved",
         days=task.case.days,
         seed=task.seed,
         forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
@@ -323,7 +327,8 @@ def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
         if task.row.optimum == "bound":
             return _rows_of_figures(weeks, {ALL: best.bound})
         achieved = evaluate(weeks, [Contender(_ROW, AchievedPath(best))], beside=False).rows
-        return pd.concat([achieved, _rows_of_figures(weeks, best.alone)], ignore_index=True)
+        others = _rows_of_figures(weeks, {**best.alone, **best.uncoordinated})
+        return pd.concat([achieved, others], ignore_index=True)
     agents = made.agents if task.row.agents_alone and len(made.agents) > 1 else ()
     controller = make_controller(made.spec, weeks.sim.fleet)
     contender = Contender(_ROW, controller, agents=agents)

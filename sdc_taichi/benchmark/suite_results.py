@@ -29,6 +29,8 @@ from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation
 from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.uncoordinated import WAYS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -221,19 +223,19 @@ def evaluation_of(case: CaseResults) -> Evaluation:
     """Convert results of a case to an evaluation, with rows as controllers, seeds as trainings.
 
     Runs of single agents are included, except for those of the optimum, whose objective values
-    become ``Evaluation.alone``.
+    become ``Evaluation.alone`` and ``Evaluation.uncoordinated``.
 
     Args:
         case: results of the case.
     """
     import pandas as pd
 
-    frames, alone = [], {}
+    frames, beside = [], {}
     for name, results in case.rows.items():
         for result in results:
             frame = result.frame.assign(controller=name, training=result.seed)
             if result.kind == ACHIEVED:
-                alone = {
+                beside = {
                     str(moves): part["figure"].to_numpy(np.float64)
                     for moves, part in frame[frame["moves"] != ALL].groupby("moves", sort=False)
                 }
@@ -245,7 +247,8 @@ def evaluation_of(case: CaseResults) -> Evaluation:
     return Evaluation(
         rows=rows,
         objective=case.objective,
-        alone=alone,
+        alone={moves: x for moves, x in beside.items() if moves in AGENTS},
+        uncoordinated={moves: x for moves, x in beside.items() if moves in WAYS},
         strata=np.array([sites.index(site) for site in first["site"]], dtype=np.int64),
         missing=(),
     )

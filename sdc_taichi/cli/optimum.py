@@ -68,6 +68,12 @@ def optimum_command(
         str,
         typer.Option(metavar="NAME[,NAME]", help="What may be moved: load, cooling, battery."),
     ] = "load,cooling,battery",
+    uncoordinated: Annotated[
+        bool,
+        typer.Option(
+            "--uncoordinated", help="Also the figures of agents that do not plan together."
+        ),
+    ] = False,
     warm_up: Annotated[
         float,
         typer.Option(
@@ -111,6 +117,8 @@ def optimum_command(
     scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
     require_events_start_before(24.0 * days, fleet.configs)
     fleet.require_distinct_names()
+    if uncoordinated and len(movable) < 2:
+        raise ConfigError(f"--uncoordinated --agents {agents}: valid is with two or more agents")
     error = run.error()
     named = {name: make_controller(name, fleet) for name in controller or ()}
     for name, named_controller in named.items():
@@ -127,6 +135,7 @@ def optimum_command(
             agents=movable,
             scored_from=scored_from,
             inlet_limit_c=max_inlet,
+            uncoordinated=uncoordinated,
             cache=not no_cache,
             quiet=quiet,
             stop=interrupted,
@@ -166,6 +175,7 @@ def solve_beside(
     agents: tuple[Agent, ...] | None = None,
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
+    uncoordinated: bool = False,
     cache: bool = True,
     quiet: bool,
     stop: Callable[[], bool],
@@ -181,6 +191,7 @@ def solve_beside(
         scored_from: first step that counts in the objective.
         inlet_limit_c: hottest allowed inlet, in C; None is the limit of
             ``protection.ashrae_class``.
+        uncoordinated: True to compute also the figures of agents that do not plan together.
         cache: True to read stored results and to store new ones.
         quiet: True to show no progress.
         stop: function that is called regularly; the work ends when it returns True.
@@ -203,6 +214,7 @@ def solve_beside(
             scored_from=scored_from,
             inlet_limit_c=inlet_limit_c,
             precision=sim.precision,
+            uncoordinated=uncoordinated,
             cache=cache,
             progress=progress,
             stop=stop,
@@ -295,6 +307,7 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
         content: content of optimum.json.
         steps_per_hour: number of steps in an hour.
     """
+    from sdc_taichi.optimum.uncoordinated import title_of
     from sdc_taichi.run.optimum_folder import optimum_remarks
 
     console = wide_console(200)
@@ -311,6 +324,7 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
         "achieved (% against idle)",
         "gap (points)",
         *(f"{name} alone (%)" for name in content["total"]["alone"]),
+        *(f"{title_of(way)} (%)" for way in content["total"]["uncoordinated"]),
         *(f"{each['controller']} (% of the achievable)" for each in controllers),
     ]
     columns = [
@@ -341,5 +355,6 @@ def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[
         change_pct(figures["achieved"]),
         figures["gap_points"],
         *(change_pct(value) for value in figures["alone"].values()),
+        *(change_pct(value) for value in figures["uncoordinated"].values()),
         *(None if share is None else 100.0 * share for share in shares),
     ]

@@ -142,6 +142,9 @@ class Evaluation:
     alone: dict[str, F64]
     """Optimal objective of each week if only one agent acts, (B,), by agent; empty without an
     optimum."""
+    uncoordinated: dict[str, F64]
+    """Optimal objective of each week if agents do not plan together, (B,), by the names of
+    ``optimum.uncoordinated``; empty if it was not computed."""
     strata: I64
     """Index of the site of each data-center week, (B,)."""
     missing: tuple[str, ...]
@@ -155,6 +158,7 @@ def prepare(
     objective: Objective | str = "carbon",
     optimum: bool = True,
     exact_ends: bool = False,
+    uncoordinated: bool = False,
     days: int = DAYS_PER_WEEK,
     seed: int = 0,
     forecast_error: ForecastError = PERFECT,
@@ -173,6 +177,8 @@ def prepare(
             the end, and the share of the achievable saving.
         exact_ends: True to value energy and work left at the end of each run by a linear programme,
             which takes about a second per week; False to interpolate the value from curves.
+        uncoordinated: True to compute with the optimum also the figures of agents that do not plan
+            together.
         days: days of each week to run, 2..7; the first day is not scored.
         seed: seed of sampled events, controllers and forecast errors.
         forecast_error: sizes of the errors of the controllers' forecasts.
@@ -205,6 +211,7 @@ def prepare(
                 objective=aim,
                 scored_from=scored_from,
                 precision=precision,
+                uncoordinated=uncoordinated,
                 cache=cache,
                 progress=progress,
                 stop=stop,
@@ -330,6 +337,7 @@ def evaluate(
         rows=rows,
         objective=weeks.objective,
         alone={} if best is None else dict(best.alone),
+        uncoordinated={} if best is None else dict(best.uncoordinated),
         strata=weeks.strata,
         missing=tuple(dict.fromkeys(missing)),
     )

@@ -7,7 +7,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -48,6 +48,10 @@ class _EntryText(BaseModel):
     """``Entry.failures``."""
     certificate: dict[str, float]
     """``Entry.certificate``."""
+    uncoordinated: dict[str, _Figure] = {}
+    """``Entry.uncoordinated``."""
+    uncoordinated_failures: tuple[str, ...] = ()
+    """``Entry.uncoordinated_failures``."""
 
 
 class OptimumCacheWarning(SdcWarning):
@@ -83,6 +87,11 @@ class Entry:
     """Cooling commands of the best plan, in steps of the setpoint, (T,)."""
     battery: F64
     """Battery commands of the best plan, (T,)."""
+    uncoordinated: Mapping[str, float] = field(default_factory=dict)
+    """Figures of plans that agents make without coordination, by the names of
+    ``uncoordinated.uncoordinated``; empty if they were not simulated."""
+    uncoordinated_failures: tuple[str, ...] = ()
+    """Constraints that plans of ``uncoordinated`` break, in words."""
 
 
 def key_of(fingerprint: str, arguments: Mapping[str, Any]) -> str:

@@ -126,9 +126,11 @@ class DispatchProgramme:
         self._programme = Programme()
         nothing = Linear(np.zeros(self._size))
         self._converted = problem.storage.conversion(problem.step_h)
-        standby = nothing + float(self._converted.standby_kwh)
+        drawn = nothing + float(self._converted.standby_kwh)
+        if problem.battery_kwh is not None and not self._has_battery:
+            drawn = Linear(problem.battery_kwh[self._steps])
         self._base_cost = float(
-            curves.base_cost[self._steps].sum() + problem.kwh_weight[self._steps] @ standby.constant
+            curves.base_cost[self._steps].sum() + problem.kwh_weight[self._steps] @ drawn.constant
         )
         self._executed, self._energy_kwh = self._add_segments(curves)
         self._queue, self._start_tasks = nothing, nothing[0]
@@ -136,8 +138,8 @@ class DispatchProgramme:
         self._within_deadline = nothing
         if "load" in problem.agents:
             self._add_queue()
-        # All charged energy includes standby, which a battery without a plan draws as well.
-        self._charge, self._discharge = standby, nothing
+        # All charged energy includes standby, which an idle battery draws as well.
+        self._charge, self._discharge = drawn, nothing
         self._stored = nothing + (span.start_kwh or 0.0)
         if self._has_battery:
             self._add_battery(stage)

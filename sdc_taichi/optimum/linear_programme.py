@@ -475,6 +475,7 @@ def _taken(problem: Problem, steps: I64) -> Problem:
             most_executed_tasks=work.most_executed_tasks[steps],
         ),
         idle_setpoint_c=problem.idle_setpoint_c[steps],
+        battery_kwh=None if problem.battery_kwh is None else problem.battery_kwh[steps],
         scored_from=0,
     )
 

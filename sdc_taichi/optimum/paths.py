@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -70,10 +70,77 @@ def path_of(
     Raises:
         ConfigError: No plan satisfies the limits.
     """
-    executed = problem.work.idle_tasks
+    plans: dict[Agent, F64] = {}
     if "load" in agents:
-        executed = plan(replace(problem, agents=agents), check=check).executed_tasks
-    return _path(problem, agents, executed)
+        plans["load"] = plan(replace(problem, agents=agents), check=check).executed_tasks
+    for agent in agents:
+        if agent != "load":
+            plans[agent] = best_response(problem, agent, plans)
+    return targets_of(problem, plans)
+
+
+def best_response(
+    problem: Problem,
+    agent: Agent,
+    others: Mapping[Agent, F64],
+    check: Callable[[], None] = lambda: None,
+) -> F64:
+    """Return the best plan of one agent while other agents follow known plans, (T,).
+
+    The plan of ``load`` is the executed work in tasks, that of ``cooling`` the setpoint in C, and
+    that of ``battery`` the energy stored after each step in kWh.
+
+    Args:
+        problem: The planning problem.
+        agent: Agent of the plan.
+        others: Plans of other agents; agents without a plan are idle.
+        check: Called before every linear programme; an error that it raises ends the work.
+
+    Raises:
+        ConfigError: No plan satisfies the limits.
+    """
+    known = _following(problem, others)
+    if agent == "load":
+        return plan(replace(known, agents=(agent,)), check=check).executed_tasks
+    utilisation = _utilisation(known)
+    if agent == "cooling":
+        return _setpoints_c(known, utilisation)
+    return _stored_kwh(known, facility_kwh(known.table, utilisation, known.idle_setpoint_c))
+
+
+def targets_of(problem: Problem, plans: Mapping[Agent, F64]) -> Targets:
+    """Return the target states of a path on which agents follow their plans.
+
+    Args:
+        problem: The planning problem.
+        plans: Plans as from ``best_response``; agents without a plan are idle.
+    """
+    known = _following(problem, plans)
+    facility = facility_kwh(known.table, _utilisation(known), known.idle_setpoint_c)
+    nothing = np.full(problem.steps, np.nan)
+    queue = _queue_tasks(problem, plans["load"]) if "load" in plans else nothing
+    stored = plans.get("battery", nothing)
+    return Targets(*(x[:, None] for x in (queue, known.idle_setpoint_c, stored, facility)))
+
+
+def _following(problem: Problem, plans: Mapping[Agent, F64]) -> Problem:
+    """Return a problem in which agents follow plans instead of idle commands."""
+    known = problem
+    if "load" in plans:
+        known = replace(known, work=replace(problem.work, idle_tasks=plans["load"]))
+    if "cooling" in plans:
+        known = replace(known, idle_setpoint_c=plans["cooling"])
+    if "battery" in plans:
+        stored, storage = plans["battery"], problem.storage
+        before = np.concatenate([[storage.stored_kwh], stored[:-1]])
+        bus_kwh = bus_energy_kwh(stored, before, storage.conversion(problem.step_h))
+        known = replace(known, battery_kwh=bus_kwh)
+    return known
+
+
+def _utilisation(problem: Problem) -> F64:
+    """Return the utilisation of each step under the work of a problem's load, 0..1, (T,)."""
+    return np.minimum(problem.work.idle_tasks / TASKS_PER_STEP, 1.0)
 
 
 def with_battery_for(problem: Problem, path: Targets, facility_kwh: F64) -> Targets:
@@ -101,19 +168,6 @@ def weight_of_kwh(problem: Problem) -> F64:
     scored = weight[problem.scored_from :]
     weight[: problem.scored_from] = _UNSCORED_SHARE * (scored.mean() or 1.0)
     return weight
-
-
-def _path(problem: Problem, agents: tuple[Agent, ...], executed_tasks: F64) -> Targets:
-    """Plan the setpoints and the battery of a path for known work, in tasks, (T,)."""
-    setpoint_c = problem.idle_setpoint_c
-    utilisation = np.minimum(executed_tasks / TASKS_PER_STEP, 1.0)
-    if "cooling" in agents:
-        setpoint_c = _setpoints_c(problem, utilisation)
-    facility = facility_kwh(problem.table, utilisation, setpoint_c)
-    nothing = np.full(problem.steps, np.nan)
-    queue = _queue_tasks(problem, executed_tasks) if "load" in agents else nothing
-    stored = _stored_kwh(problem, facility) if "battery" in agents else nothing
-    return Targets(*(x[:, None] for x in (queue, setpoint_c, stored, facility)))
 
 
 def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:

@@ -149,7 +149,8 @@ class Problem:
     step_h: float
     """Length of a step, in h."""
     agents: tuple[Agent, ...]
-    """Agents that the plan may control; the others follow idle commands."""
+    """Agents that the plan may control; the others follow ``work.idle_tasks``, ``idle_setpoint_c``
+    and ``battery_kwh``."""
     table: FacilityTable
     """Energy, water and inlet temperature of each step, by utilisation and setpoint."""
     kwh_weight: F64
@@ -175,6 +176,9 @@ class Problem:
     """Maximum change of the setpoint between two steps, in K."""
     scored_from: int
     """Number of the first scored step."""
+    battery_kwh: F64 | None = None
+    """Energy that a battery outside ``agents`` draws from the bus in each step, standby included,
+    in kWh, (T,); negative where the battery delivers. None means an idle battery."""
 
     @property
     def steps(self) -> int:

@@ -56,6 +56,9 @@ class Optimum:
     """Lowest figure of the simulated plans that satisfy the constraints, (B,)."""
     alone: Mapping[str, F64]
     """Lowest figure of simulated plans that move one agent alone, by agent, (B,) each."""
+    uncoordinated: Mapping[str, F64]
+    """Figures of plans that agents make without coordination, (B,) each, by the names of
+    ``uncoordinated.uncoordinated``; empty if they were not asked for."""
     bound_kinds: tuple[str, ...]
     """Kind of each data center's bound: ``bound``, or ``estimate`` or ``none`` and the reason."""
     failures: tuple[tuple[str, ...], ...]

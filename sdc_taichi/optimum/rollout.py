@@ -415,6 +415,14 @@ class Certificate:
             idle: Certificate of idle commands.
             capacity_kwh: Capacity of the battery, in kWh.
         """
+        return (*self.worse_ends(capacity_kwh), *self.broken(idle))
+
+    def worse_ends(self, capacity_kwh: float) -> tuple[str, ...]:
+        """Return in words how the end state is worse than that of the first scored step.
+
+        Args:
+            capacity_kwh: Capacity of the battery, in kWh.
+        """
         missing_kwh = self.start_kwh - self.end_kwh
         more_tasks = self.end_tasks - self.start_tasks
         texts = []
@@ -422,13 +430,21 @@ class Certificate:
             texts.append(f"ends with {missing_kwh:.4g} kWh less in the battery")
         if more_tasks > _LEAST_TASKS:
             texts.append(f"ends with {more_tasks:.4g} tasks more in the queue")
+        return tuple(texts)
+
+    def broken(self, idle: Certificate) -> tuple[str, ...]:
+        """Return the constraints on work and temperatures that the plan breaks, in words.
+
+        Args:
+            idle: Certificate of idle commands.
+        """
         hot = ""
         if self.over_limit_k > LEAST_K:
             over_k = self.hottest_inlet_c - self.inlet_limit_c
             hot = f"has inlets up to {over_k:.3g} K over the limit of {self.inlet_limit_c:g} C"
             if over_k > self.over_limit_k + LEAST_K:
                 hot += f", {self.over_limit_k:.3g} K over the least possible in a step"
-        texts += broken_constraints(
+        texts = broken_constraints(
             self.dropped_tasks - idle.dropped_tasks,
             (self.overdue_tasks, idle.overdue_tasks),
             hot,

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,10 +20,19 @@ from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.optimum.cache import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.paths import IDLE, JOINT, agents_of, path_of, with_battery_for
+from sdc_taichi.optimum.paths import (
+    IDLE,
+    JOINT,
+    agents_of,
+    best_response,
+    path_of,
+    targets_of,
+    with_battery_for,
+)
 from sdc_taichi.optimum.problem import (
     AGENTS,
     Agent,
+    Ends,
     Problem,
     StoppedError,
     forced_discharge_reason,
@@ -49,6 +58,7 @@ from sdc_taichi.optimum.task import (
     checked_start,
     seeds_of_sampled_events,
 )
+from sdc_taichi.optimum.uncoordinated import response_count, title_of, uncoordinated
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.bills import with_prices
@@ -70,6 +80,8 @@ _POLL_S = 0.2
 """Time between two calls of ``stop``, in s."""
 
 _X = TypeVar("_X")
+_Plans = list[F64 | None]
+"""Plans of one agent in B data centers; None where no plan satisfies the limits."""
 Progress = Callable[[str, int, int], None]
 """Progress callback ``(stage, done, total)``."""
 
@@ -86,6 +98,7 @@ def solve(
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
     precision: Precision = "f32",
+    uncoordinated: bool = False,
     cache: bool | str | os.PathLike[str] = True,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
@@ -109,6 +122,8 @@ def solve(
         inlet_limit_c: Highest inlet temperature that plans may cause if another setpoint avoids it,
             in C. None means the limit of ``protection.ashrae_class``, or no limit without it.
         precision: Floating-point precision of the hall kernels.
+        uncoordinated: True to compute also the figures of plans that two or more agents make
+            without coordination (``Optimum.uncoordinated``), which takes several times as long.
         cache: True to read and write results in the user's cache, False for no cache, or the
             folder of a cache.
         progress: Progress callback ``(stage, done, total)``.
@@ -145,6 +160,7 @@ def solve(
         scored_from=whole_number("scored_from", scored_from, 0, steps - 1),
         inlet_limit_c=inlet_limit_c,
         precision=precision,
+        uncoordinated=uncoordinated and len(checked_agents(agents)) > 1,
     )
     used_cache = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
@@ -176,8 +192,15 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
         bound=each("bound"),
         achieved=each("achieved"),
         alone={agent: np.array([entry.alone[agent] for entry in entries]) for agent in task.agents},
+        uncoordinated={
+            way: np.array([entry.uncoordinated[way] for entry in entries])
+            for way in (entries[0].uncoordinated if task.uncoordinated else ())
+        },
         bound_kinds=tuple(entry.kind for entry in entries),
-        failures=tuple(entry.failures for entry in entries),
+        failures=tuple(
+            entry.failures + (entry.uncoordinated_failures if task.uncoordinated else ())
+            for entry in entries
+        ),
         certificates=tuple(entry.certificate for entry in entries),
         load=paths("load"),
         cooling=paths("cooling"),
@@ -210,6 +233,11 @@ class _Case:
     """Lower bound of the figure; nan if there is none."""
     runs: dict[str, _Run] = field(default_factory=dict)
     """Plans simulated so far, by name."""
+    uncoordinated: tuple[str, ...] = ()
+    """Names of the plans in ``runs`` that agents made without coordination."""
+    responses: dict[tuple[Any, ...], F64 | None] = field(default_factory=dict)
+    """Best responses computed so far, by agent and plans of the others; None if no plan satisfies
+    the limits."""
 
     @property
     def joint(self) -> _Run:
@@ -218,7 +246,11 @@ class _Case:
 
     def entry(self) -> Entry:
         """Return the cache entry with the bound, the best simulated plan and its figure."""
-        certificates = {name: run.certificate for name, run in self.runs.items()}
+        certificates = {
+            name: run.certificate
+            for name, run in self.runs.items()
+            if name not in self.uncoordinated
+        }
         idle = certificates[IDLE]
         failures = {
             name: of_path.failures(idle, self.problem.storage.capacity_kwh)
@@ -255,7 +287,61 @@ class _Case:
             load=done.load_command[:, 0],
             cooling=done.cooling_command[:, 0],
             battery=done.battery_command[:, 0],
+            uncoordinated={
+                way: _valued_figure(self.problem, self.runs[way].certificate)
+                for way in self.uncoordinated
+            },
+            uncoordinated_failures=tuple(
+                f"the path of {title_of(way)} {text}"
+                for way in self.uncoordinated
+                for text in self.runs[way].certificate.broken(idle)
+            ),
         )
+
+    def best_response(
+        self, agent: Agent, others: Mapping[Agent, F64], check: Callable[[], None]
+    ) -> F64 | None:
+        """Return the best plan of one agent for known plans of others, (T,).
+
+        Args:
+            agent: Agent of the plan.
+            others: Plans of other agents; agents without a plan are idle.
+            check: Called regularly; an error that it raises ends the work.
+
+        Returns:
+            The plan; None if no plan satisfies the limits.
+        """
+        known = dict(others)
+        if agent == "cooling" or not self.problem.months:
+            # Setpoints, and without demand charges all plans, do not depend on the battery.
+            known.pop("battery", None)
+        key = agent, *((name, known[name].tobytes()) for name in sorted(known))
+        if key not in self.responses:
+            try:
+                self.responses[key] = best_response(self.problem, agent, known, check)
+            except ConfigError:
+                self.responses[key] = None
+        return self.responses[key]
+
+
+def _of_case(plans: Mapping[Agent, _Plans], i: int) -> dict[Agent, F64]:
+    """Return the plans of data center ``i``, without those of agents that have none."""
+    of_case = {agent: of_all[i] for agent, of_all in plans.items()}
+    return {agent: plan for agent, plan in of_case.items() if plan is not None}
+
+
+def _valued_figure(problem: Problem, of_path: Certificate) -> float:
+    """Return the figure of a path, plus the value of what it lacks at its end.
+
+    The value is the difference of the bounds for this end and for an end equal to the start.
+    """
+    if not of_path.worse_ends(problem.storage.capacity_kwh):
+        return of_path.figure
+    start = of_path.start_kwh, of_path.start_tasks
+    ends = Ends(*start, of_path.end_kwh, of_path.end_tasks)
+    return (
+        of_path.figure + bound(problem, Ends(*start, *start)).figure - bound(problem, ends).figure
+    )
 
 
 def _unreachable_limit(best: Certificate) -> tuple[str, ...]:
@@ -331,7 +417,11 @@ class _Work:
         entries: dict[int, Entry] = {}
         if cache is not None:
             known = {i: cache.find(key, task.steps, task.agents) for i, key in enumerate(keys)}
-            entries = {i: entry for i, entry in known.items() if entry is not None}
+            entries = {
+                i: entry
+                for i, entry in known.items()
+                if entry is not None and (entry.uncoordinated or not task.uncoordinated)
+            }
         missing = [i for i in range(task.fleet.size) if i not in entries]
         self._all, self._kept, self._missing = len(keys), len(entries), len(missing)
         for part in task.parts(missing):
@@ -358,6 +448,8 @@ class _Work:
         ]
         self._run(task, cases, self._bounds_and_paths(cases))
         self._plan_batteries_again(task, cases)
+        if task.uncoordinated:
+            self._run_uncoordinated(task, cases)
         return cases
 
     def _bounds_and_paths(self, cases: Sequence[_Case]) -> list[dict[str, Targets]]:
@@ -399,12 +491,47 @@ class _Work:
         paths = self._in_threads([partial(battery_again, case) for case in again])
         self._run(task.part(chosen), again, [{_AGAIN: path} for path in paths])
 
-    def _in_threads(self, calls: Sequence[Callable[[Callable[[], None]], _X]]) -> list[_X]:
+    def _run_uncoordinated(self, task: Task, cases: Sequence[_Case]) -> None:
+        """Simulate the plans that the agents of B data centers make without coordination."""
+        count, all_calls = 0, response_count(len(task.agents))
+
+        def responses(agent: Agent, others: Mapping[Agent, _Plans]) -> _Plans:
+            nonlocal count
+            count += 1
+            return self._in_threads(
+                [
+                    partial(case.best_response, agent, _of_case(others, i))
+                    for i, case in enumerate(cases)
+                ],
+                "best responses",
+                (count - 1, all_calls),
+            )
+
+        ways = uncoordinated(task.agents, responses)
+        for case in cases:
+            case.uncoordinated = tuple(ways)
+        self._run(
+            task,
+            cases,
+            [
+                {way: targets_of(case.problem, _of_case(plans, i)) for way, plans in ways.items()}
+                for i, case in enumerate(cases)
+            ],
+        )
+
+    def _in_threads(
+        self,
+        calls: Sequence[Callable[[Callable[[], None]], _X]],
+        stage: str = "programmes",
+        part: tuple[int, int] = (0, 1),
+    ) -> list[_X]:
         """Call functions in parallel threads and return their results in order.
 
         Args:
             calls: Functions that release Python's global lock most of the time. Their argument is a
                 function that raises an error if the work is to end.
+            stage: Name of the stage in reports of progress.
+            part: Index of this call among the calls of the stage, and their number.
         """
         pool, ends = ThreadPoolExecutor(runtime.ensure_started()), Event()
 
@@ -418,9 +545,9 @@ class _Work:
             while waiting:
                 self._go_on()
                 _, waiting = wait(waiting, timeout=_POLL_S)
-                share = 1.0 - len(waiting) / len(calls)
+                share = (part[0] + 1.0 - len(waiting) / len(calls)) / part[1]
                 done = self._solved + round(share * self._size)
-                self._progress("programmes", done, self._missing)
+                self._progress(stage, done, self._missing)
             return [future.result() for future in futures]
         finally:
             ends.set()

@@ -53,6 +53,9 @@ class Task:
     means the limit of ``protection.ashrae_class``."""
     precision: Precision
     """Floating-point precision of the hall kernels."""
+    uncoordinated: bool = False
+    """True to simulate also the plans of agents that do not plan together. Cached results of both
+    kinds have the same key."""
 
     def part(self, where: Sequence[int]) -> Task:
         """Return the task of some of the data centers.

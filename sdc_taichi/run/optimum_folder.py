@@ -47,6 +47,7 @@ def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> di
     total = _figures(
         {name: float(getattr(optimum, name).sum()) for name in _FIGURES},
         {name: float(values.sum()) for name, values in optimum.alone.items()},
+        {name: float(values.sum()) for name, values in optimum.uncoordinated.items()},
     )
     return {
         "format": FORMAT,
@@ -196,6 +197,7 @@ def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
     figures = _figures(
         {name: float(getattr(optimum, name)[dc]) for name in _FIGURES},
         {name: float(values[dc]) for name, values in optimum.alone.items()},
+        {name: float(values[dc]) for name, values in optimum.uncoordinated.items()},
     )
     return {
         "name": optimum.names[dc],
@@ -207,7 +209,9 @@ def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
     }
 
 
-def _figures(figures: Mapping[str, float], alone: Mapping[str, float]) -> dict[str, Any]:
+def _figures(
+    figures: Mapping[str, float], alone: Mapping[str, float], uncoordinated: Mapping[str, float]
+) -> dict[str, Any]:
     """Return objective values, and the gap from bound to achieved value in % of the idle value."""
     idle, bound, achieved = (figures[name] for name in _FIGURES)
     gap = 100.0 * (achieved - bound) / idle if idle else math.nan
@@ -215,6 +219,7 @@ def _figures(figures: Mapping[str, float], alone: Mapping[str, float]) -> dict[s
         **{name: finite_or_none(value) for name, value in figures.items()},
         "gap_points": finite_or_none(gap),
         "alone": {name: finite_or_none(value) for name, value in alone.items()},
+        "uncoordinated": {name: finite_or_none(value) for name, value in uncoordinated.items()},
     }
 
 
