@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi import OddInputWarning, load_config, preset_names, vector_env
+from sdc_taichi.envs.agents import AGENTS
 
 PLACED = {"workload.placement": "weights"}
 FANS = {"hvac.crac.flow_model": "controlled"}
@@ -26,6 +27,12 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, list[str]], dict[str, Any]]] = 
     "fans": (FANS, {"agent_dc": ["cooling", "fan"]}, {}),
     "continuous fans": (FANS, {"agent_dc": ["cooling", "fan"]}, {"actions": "continuous"}),
     "placement": (PLACED, {"agent_ls": ["load", "placement"]}, {"actions": "continuous"}),
+    "units": (
+        {},
+        {"crac": ["fan", "cooling"], "plant": ["chilled_water"]},
+        {"agents": ["crac", "plant"], "actions": "continuous", "neighbours": 2},
+    ),
+    "sites": ({}, {}, {"agents": [*AGENTS, "agent_geo"], "actions": "continuous"}),
 }
 """Overrides, commands and options of environments by kind of actions."""
 
@@ -33,10 +40,15 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, list[str]], dict[str, Any]]] = 
 def cases() -> Iterator[tuple[str, str]]:
     """Yield each preset with each kind of actions that it can have."""
     for preset in preset_names():
-        recirculates = load_config(preset).hall.inlet_model == "recirculation"
-        for kind, (overrides, _, _) in KINDS.items():
-            if recirculates or FANS.keys() != overrides.keys():
-                yield preset, kind
+        config = load_config(preset)
+        of_units = config.hvac.crac.flow_model == "controlled"
+        has = {
+            "fans": config.hall.inlet_model == "recirculation" and not of_units,
+            "placement": not of_units,
+            "units": of_units,
+            "sites": config.fleet is not None,
+        }
+        yield from ((preset, kind) for kind in KINDS if has.get(kind.split()[-1], True))
 
 
 def play(
@@ -64,7 +76,9 @@ def play(
     for _ in range(steps):
         actions = {}
         for agent, space in spaces.items():
-            shape = (envs, *(space.shape or ()))
+            names = env.core.members[agent]
+            members = () if names == (agent,) else (len(names),)
+            shape = (envs, *members, *(space.shape or ()))
             is_number = space.dtype is not None and space.dtype.kind == "f"
             drawn = rng.uniform(-1.0, 1.0, shape) if is_number else rng.integers(0, 3, shape)
             actions[agent] = drawn.astype(space.dtype)

@@ -180,6 +180,6 @@ def test_actions_of_decoded_commands_are_the_actions(actions: str) -> None:
             actions_of_agents["agent_bat"] = actions_of_agents["agent_bat"][:, 0]
         else:
             actions_of_agents = {a: rng.uniform(-1.0, 1.0, (1, k)) for a, k in widths.items()}
-        commands = Actions(**core._decoder.decode(actions_of_agents, core.view.state))
+        commands = Actions(**core._decoder.decode(actions_of_agents, core.view))
         for agent, decoded in core.actions_of(commands).items():
             np.testing.assert_allclose(decoded, actions_of_agents[agent], rtol=1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,8 @@ import numpy.typing as npt
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
+MOST_NEIGHBOURS = 8
+"""Largest number of neighbouring units that an agent observes."""
 _STREAM = zlib.crc32(b"inlet sensors")
 """Last key of the random streams of the sensor errors."""
 
@@ -111,6 +114,28 @@ class UnitZones:
         if running is not self._running and not np.array_equal(running, self._running):
             self._index, self._running = self._indexed(running), running.copy()
         return self._index
+
+    @cached_property
+    def nearest(self) -> I64:
+        """Units whose supply reaches the same racks as that of each unit, most first, (8, U).
+
+        In data centers with fewer than nine units, the unit itself fills the last places.
+        """
+        fleet, air = self._fleet, self._fleet.air
+        nearest = np.tile(np.arange(fleet.units), (MOST_NEIGHBOURS, 1))
+        for dc in range(fleet.size if air is not None else 0):
+            assert air is not None
+            units = slice(*fleet.unit_offsets[dc : dc + 2])
+            racks = slice(*fleet.rack_offsets[dc : dc + 2])
+            at = slice(*air.unit_share_offsets[dc : dc + 2])
+            shares = air.unit_shares[at].reshape(racks.stop - racks.start, -1)
+            common = shares.T @ (air.rack_need_m3s[racks, None] * shares)
+            np.fill_diagonal(common, -1.0)
+            order = np.argsort(-common, axis=0, kind="stable")[
+                : min(MOST_NEIGHBOURS, len(common) - 1)
+            ]
+            nearest[: len(order), units] = units.start + order
+        return nearest
 
     def _indexed(self, running: F64) -> _ZoneIndex:
         fleet, zones = self._fleet, []

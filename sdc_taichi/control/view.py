@@ -250,6 +250,9 @@ class View:
     """Supply air of each CRAC unit divided by what the racks need of it, 0..10, (U,), at the end of
     the last step: the pressure before its tiles as a multiple of that which just meets the need. 1
     before the first step."""
+    flows_tasks: F64
+    """Work that sites of each fleet sent to each other in the last step, in tasks, by fleet, sender
+    and receiver, (F, S, S)."""
     zone_loads: ZoneLoads | None
     """Loads of the zones of halls, see ``workload.zone_loads``; None without any."""
     forecast_error: ForecastError = PERFECT
@@ -296,6 +299,14 @@ class View:
     def unit_running(self) -> F64:
         """1 for CRAC units that ran in the last step, 0 for units that were down, (U,)."""
         return self._zone_readings.unit_running
+
+    @property
+    def nearest_units(self) -> I64:
+        """Units that feed most of the racks of each CRAC unit, the most first, (8, U).
+
+        In data centers with fewer than nine units, the unit itself fills the last places.
+        """
+        return self.zones.nearest
 
     @property
     def _zone_readings(self) -> ZoneReadings:
@@ -376,6 +387,8 @@ def view_maker(
     limits, sizing = limits_of(sim.fleet), sim.sizing
     walks: RandomWalks | None = None
     zones, even = UnitZones(sim.fleet), np.ones(sim.fleet.units)
+    sites = sim.fleet.sites_per_fleet
+    no_flows = np.zeros((sim.size // sites, sites, sites))
     if forecast_error != PERFECT:
         seeds = walk_keys(sim.state.seed, sim.fleet.names) if keys is None else keys
         walks = RandomWalks(seeds, step_h)
@@ -392,6 +405,7 @@ def view_maker(
             sim.precision,
             zones,
             even if last is None else sim.supply_ratio(),
+            no_flows if last is None else sim.flows_tasks().copy(),
             sim.zone_loads,
             forecast_error,
             walks,

@@ -10,8 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from sdc_taichi.control.view import View
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.site_order import cleaner_first, shares_of_sites
+from sdc_taichi.envs.unit_slots import UnitSlots
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
 from sdc_taichi.types import F64, Actions, State
@@ -23,6 +28,8 @@ PLACEMENT_FACTOR = 10.0
 """Placement weight of a rack at a continuous action of 1; an action of -1 gives the reciprocal."""
 _NEUTRAL = {"placement": 1.0}
 """Neutral values of the commands that are not neutral at 0."""
+CHILLED_WATER_SPAN_K = 6.0
+"""Difference from the warmest possible chilled water to that of a continuous action of -1, in K."""
 _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
 """Simulation stage, and the model of this stage, that a command requires."""
 
@@ -34,9 +41,10 @@ class AgentActions:
         fleet: the B data centers, with U CRAC units and R racks in total.
         options: learning agents, their commands and the meaning of their actions.
         clip: whether continuous actions are clipped to -1..1 if ``options.clip_actions`` is None.
+        slots: places of CRAC units in the actions of their agents; None means as few as fit.
 
     Attributes:
-        spaces: action space of each learning agent in one environment.
+        spaces: action space of a learning agent, by group.
         commands: names of the commands that learning agents decide.
         action_order: order of the battery's discrete actions, ``paper`` or ``sustaindc``.
 
@@ -45,28 +53,38 @@ class AgentActions:
             control, or a model of the fleet does not accept a command.
     """
 
-    def __init__(self, fleet: Fleet, options: EnvOptions, *, clip: bool = False) -> None:
+    def __init__(
+        self,
+        fleet: Fleet,
+        options: EnvOptions,
+        *,
+        clip: bool = False,
+        slots: UnitSlots | None = None,
+    ) -> None:
         self._clip = clip if options.clip_actions is None else options.clip_actions
         self._agents: tuple[str, ...] = options.agents
         self._continuous = options.actions == "continuous"
         decided = {agent: options.commands_of(agent) for agent in self._agents}
         self.commands = tuple(name for names in decided.values() for name in names)
         _check_models(fleet, self.commands)
-        units = equal_number(fleet.unit_offsets, "CRAC units (hvac.crac.units)")
-        widths = {"cooling": units, "fan": units}
-        if "placement" in self.commands:
-            widths["placement"] = equal_number(fleet.rack_offsets, "racks")
+        if "transfer" in self.commands and fleet.sites_per_fleet == 1:
+            raise ConfigError("agents: agent_geo needs a fleet; valid with a config that has fleet")
+        self._fleet, self._slots = fleet, UnitSlots(fleet) if slots is None else slots
+        self._of_units = {a for a in self._agents if AGENT_DEFINITIONS[a].per_unit}
+        widths: dict[str, dict[str, int]] = {
+            agent: {name: self._width(agent, name) for name in names}
+            for agent, names in decided.items()
+        }
         self._columns: dict[str, tuple[tuple[str, slice | None], ...]] = {
-            agent: _columns(names, widths) for agent, names in decided.items()
+            agent: _columns(of_commands) for agent, of_commands in widths.items()
         }
-        self._widths: dict[str, int] = {
-            agent: sum(widths.get(name, 1) for name in names) for agent, names in decided.items()
-        }
+        self._widths: dict[str, int] = {agent: sum(x.values()) for agent, x in widths.items()}
         self.spaces: dict[str, spaces.Space[Any]] = {
             agent: self._space(width) for agent, width in self._widths.items()
         }
-        self._shapes = {
-            agent: (fleet.size, *(space.shape or ())) for agent, space in self.spaces.items()
+        self._shapes: dict[str, tuple[int, ...]] = {
+            agent: (*self._rows_shape(agent), *(space.shape or ()))
+            for agent, space in self.spaces.items()
         }
         order = options.action_order
         if order is None:
@@ -80,18 +98,23 @@ class AgentActions:
             "fan": three_ways,
             "battery": np.array(BATTERY_COMMANDS[order]),
             "placement": PLACEMENT_FACTOR**three_ways,
+            "chilled_water": three_ways,
+            "transfer": three_ways,
         }
         self._setpoint_change_k = options.setpoint_change_k
-        self._setpoint_step_k = np.repeat(fleet.values("hvac.setpoint.step_k"), units)
-        self._fan_steps = options.fan_change / np.repeat(fleet.values("hvac.crac.fan_step"), units)
+        self._setpoint_step_k = fleet.values("hvac.setpoint.step_k")[fleet.unit_dc]
+        self._fan_steps = options.fan_change / fleet.values("hvac.crac.fan_step")[fleet.unit_dc]
+        self._coil_approach_k = fleet.values("hvac.chiller.coil_approach_k")
+        self._water_range_c = CHILLERS[fleet.models["chiller"]].water_range_c
 
-    def decode(self, actions: Mapping[str, Any], state: State) -> dict[str, F64]:
+    def decode(self, actions: Mapping[str, Any], view: View) -> dict[str, F64]:
         """Convert actions to commands of the simulator by name, each (B,), (U,) or (R,).
 
         Args:
             actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
-                the agent decides k values; continuous actions are floats, (B, k).
-            state: state of the simulator before the step.
+                the agent decides k values; continuous actions are floats, (B, k). Those of CRAC
+                units have a second axis, the slots of ``UnitSlots``, after the first.
+            view: the view before the step.
 
         Raises:
             SdcError: the actions of an agent are missing or outside their space, or there are
@@ -100,36 +123,110 @@ class AgentActions:
         if not isinstance(actions, Mapping):
             raise SdcError(f"actions: {actions!r}; valid is a dict of {list(self._agents)}")
         commands: dict[str, F64] = {}
+        state = view.state
         for agent in self._agents:
             action = self._checked(agent, actions)
             for name, columns in self._columns[agent]:
-                part = action if columns is None else action[:, columns]
+                part = action if columns is None else action[..., columns]
+                if agent in self._of_units:
+                    part = self._slots.units(part.reshape(self._slots.exists.shape))
+                elif agent == "plant" and name == "cooling":
+                    part = part.reshape(-1)[self._fleet.unit_dc]
                 commands[name] = self._command(name, part.reshape(-1), state)
+        if "chilled_water" in commands:
+            reset = commands["chilled_water"]
+            commands["chilled_water"] = self._chilled_water_c(reset, commands, state)
+        if "transfer" in commands:
+            shares = np.maximum(commands["transfer"], 0.0).reshape(view.size, -1)
+            commands["transfer"] = shares_of_sites(shares, view)
         if len(actions) > len(self._agents):
             extra = sorted(set(map(str, actions)) - set(self._agents))
             raise SdcError(f"actions: {extra} do not learn here; valid: {list(self._agents)}")
         return commands
 
-    def encode(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
+    def encode(self, commands: Actions, view: View) -> dict[str, npt.NDArray[Any]]:
         """Convert commands to the nearest actions of the learning agents.
 
         Args:
             commands: commands of one step, as enum members or numbers.
+            view: the view before the step.
 
         Returns:
             Actions by learning agent, in the form that ``decode`` takes.
         """
         actions: dict[str, npt.NDArray[Any]] = {}
         for agent, shape in self._shapes.items():
-            size, width = shape[0], self._widths[agent]
+            width = self._widths[agent]
             parts = []
             for name, columns in self._columns[agent]:
                 command = as_numbers(getattr(commands, name), _NEUTRAL.get(name, 0.0))
+                if name == "transfer" and command.ndim:
+                    command = np.take_along_axis(command, cleaner_first(view), axis=1)
                 count = width if columns is None else columns.stop - columns.start
-                by_dc = command.reshape(size if command.ndim else 1, -1)
-                parts.append(self._action(name, np.broadcast_to(by_dc, (size, count))))
-            actions[agent] = np.concatenate(parts, axis=1).reshape(shape)
+                rows = self._rows(agent, name, command)
+                parts.append(self._action(name, np.broadcast_to(rows, (len(rows), count))))
+            together = np.concatenate(parts, axis=1)
+            if agent in self._of_units:
+                together = np.moveaxis(self._slots.fill(together.T), 0, -1)
+            actions[agent] = together.reshape(shape)
         return actions
+
+    def _rows(self, agent: str, name: str, command: F64) -> F64:
+        """Return a command with one row for each data center, or for each unit of an agent of it.
+
+        Raises:
+            SdcError: the command has no corresponding action.
+        """
+        fleet = self._fleet
+        if name == "chilled_water" and command.any():
+            raise SdcError(
+                f"command chilled_water {command.flat[0]:g} C: no action of {agent} gives it; "
+                "valid is None"
+            )
+        if agent in self._of_units:
+            of_units = command.ndim and len(command) == fleet.units
+            return command.reshape(-1, 1) if of_units else self._of_all(command)[fleet.unit_dc]
+        if agent == "plant" and command.shape == (fleet.units,):
+            return command[fleet.unit_offsets[:-1], None]
+        if command.ndim == 0:
+            return self._of_all(command)
+        return command.reshape(fleet.size, -1)
+
+    def _of_all(self, command: F64) -> F64:
+        """Return one value, or one per data center, as (B, 1)."""
+        return np.broadcast_to(command, self._fleet.size)[:, None]
+
+    def _width(self, agent: str, name: str) -> int:
+        """Return the number of values of a command that an agent decides."""
+        if agent == "agent_dc" and name in ("cooling", "fan"):
+            return equal_number(self._fleet.unit_offsets, "CRAC units (hvac.crac.units)")
+        if name == "placement":
+            return equal_number(self._fleet.rack_offsets, "racks")
+        if name == "transfer":
+            return self._fleet.sites_per_fleet - 1
+        return 1
+
+    def _rows_shape(self, agent: str) -> tuple[int, ...]:
+        """Return (B,), or (B, W) for a group with an agent for each CRAC unit."""
+        return self._slots.exists.shape if agent in self._of_units else (self._fleet.size,)
+
+    def _chilled_water_c(self, reset: F64, commands: Mapping[str, F64], state: State) -> F64:
+        """Return the commanded temperature of the chilled water, in C, (B,).
+
+        Args:
+            reset: 0 or more for the warmest water that serves the setpoints before and after the
+                step, -1 for the coldest, (B,).
+            commands: the other commands of the step.
+            state: state of the simulator before the step.
+        """
+        fleet, (low_c, high_c) = self._fleet, self._water_range_c
+        change_k = commands.get("cooling", np.zeros(1)) * self._setpoint_step_k
+        unit_c = np.minimum(state.setpoint_c, state.setpoint_c + change_k)
+        unit_c = np.maximum(unit_c, fleet.values("hvac.setpoint.min_c")[fleet.unit_dc])
+        coldest_c = np.minimum.reduceat(unit_c, fleet.unit_offsets[:-1])
+        most_c = coldest_c - fleet.setpoint_over_supply_k - self._coil_approach_k
+        chilled_c = most_c + CHILLED_WATER_SPAN_K * np.minimum(reset, 0.0)
+        return np.asarray(np.clip(chilled_c, low_c, high_c))
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
         """Neutral actions of the learning agents, (B,) or (B, k)."""
@@ -194,10 +291,19 @@ class AgentActions:
             return np.asarray(np.abs(command[..., None] - choices).argmin(-1))
         if name == "cooling":
             largest = self._setpoint_change_k / self._setpoint_step_k
-            command = command / largest.reshape(command.shape)
+            command = command / self._of_rows(largest, command.shape)
         elif name == "fan":
-            command = command / self._fan_steps.reshape(command.shape)
+            command = command / self._of_rows(self._fan_steps, command.shape)
         return np.clip(command, -1.0, 1.0)
+
+    def _of_rows(self, per_unit: F64, shape: tuple[int, ...]) -> F64:
+        """Arrange values of units, (U,), as those of a command: by unit, or by data center.
+
+        A command with one value for all units of a data center uses the first unit's.
+        """
+        if np.prod(shape) == len(per_unit):
+            return per_unit.reshape(shape)
+        return per_unit[self._fleet.unit_offsets[:-1], None]
 
 
 def as_numbers(command: Any, neutral: float = 0.0) -> F64:
@@ -245,13 +351,16 @@ def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
             )
 
 
-def _columns(
-    names: Sequence[str], widths: Mapping[str, int]
-) -> tuple[tuple[str, slice | None], ...]:
-    """Return each command of an agent with its columns in the action; None means all columns."""
+def _columns(widths: Mapping[str, int]) -> tuple[tuple[str, slice | None], ...]:
+    """Return each command of an agent with its columns in the action; None means all columns.
+
+    Args:
+        widths: number of columns of each command, in order.
+    """
+    names = list(widths)
     if len(names) == 1:
         return ((names[0], None),)
-    ends = np.cumsum([widths.get(name, 1) for name in names]).tolist()
+    ends = np.cumsum(list(widths.values())).tolist()
     starts = [0, *ends[:-1]]
     return tuple(
         (name, slice(first, end)) for name, first, end in zip(names, starts, ends, strict=True)

@@ -1,4 +1,9 @@
-"""The three agents of a data center: their commands, and default features and reward scales."""
+"""Groups of agents: their commands, and default features and reward scales.
+
+The agents of a group have the same spaces, and by default one policy. A group has one agent for
+each data center, which has the name of the group, or one for each CRAC unit (``crac_0``,
+``crac_1`` and so on).
+"""
 
 from __future__ import annotations
 
@@ -6,38 +11,42 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from sdc_taichi.control.rules import COMMANDS_OF_PART
-
-Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
-"""Name of an agent in the released SustainDC: load shifting, cooling, battery."""
-AGENTS: tuple[str, ...] = get_args(Agent)
-"""All agents, in the order of their actions and observations in joint environments."""
-
-NOT_LEARNED = {"chilled_water"}
-"""Fields of ``Actions`` that controllers can set, but no agent: their limits depend on the step."""
+Agent = Literal["agent_ls", "agent_dc", "agent_bat", "agent_geo", "crac", "plant"]
+"""Name of a group of agents. The first three are the agents of the released SustainDC: load
+shifting, cooling, battery."""
+AGENTS: tuple[str, ...] = get_args(Agent)[:3]
+"""Groups that learn by default, in the order of their actions and observations."""
+HALL_AGENTS: tuple[str, ...] = ("crac", "plant")
+"""Groups that control the cooling of a hall in place of ``agent_dc``."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentDefinition:
-    """Commands, default features and reward scales of an agent."""
+    """Commands, default features and reward scales of a group of agents."""
 
-    command: str
-    """Field of ``Actions`` that the agent sets by default. It also names the agent's part in
-    controller specifications such as ``load=name,cooling=name``."""
+    part: str
+    """Part of controller specifications such as ``load=name,cooling=name`` that can replace the
+    agents."""
+    commands: tuple[str, ...]
+    """Names of all fields of ``Actions`` that the agents can set, the default field first."""
     features: tuple[str, ...]
-    """Names of the features that the agent observes by default, in order."""
+    """Names of the features that an agent observes by default, in order."""
     scales: dict[str, dict[str, float]]
-    """Factors of the agent's reward terms, by reward set and term."""
+    """Factors of an agent's reward terms, by reward set and term."""
+    per_unit: bool = False
+    """True if the group has an agent for each CRAC unit, False for one agent per data center."""
+    also_controlled: tuple[str, ...] = ()
+    """Fields of ``Actions`` that no agent of the group sets, but a controller in its place."""
 
     @property
-    def commands(self) -> tuple[str, ...]:
-        """Names of all fields of ``Actions`` that the agent can set, the default field first."""
-        return tuple(name for name in self.controlled if name not in NOT_LEARNED)
+    def command(self) -> str:
+        """Field of ``Actions`` that an agent sets by default."""
+        return self.commands[0]
 
     @property
     def controlled(self) -> tuple[str, ...]:
-        """Names of all fields of ``Actions`` that a controller in place of the agent can set."""
-        return COMMANDS_OF_PART[self.command]
+        """Names of all fields of ``Actions`` that a controller in place of the group can set."""
+        return (*self.commands, *self.also_controlled)
 
 
 _CLOCK = ("time_of_day", "time_of_year")
@@ -47,9 +56,17 @@ _WEATHER = (*_OUTDOOR, "wet_bulb", "wet_bulb_forecast")
 _QUEUE = ("queue", "oldest_age", "mean_age", "age_histogram")
 _AIR = ("room", "hottest_inlet", "setpoint")
 
+_OTHER_SITES = ("site_ci", "site_ci_forecast", "site_room", "site_link", "transfers")
+_OWN_UNIT = (
+    *("unit_speed", "unit_supply", "unit_return", "unit_running"),
+    *("zone_hottest", "zone_mean", "tile_pressure", "neighbours"),
+)
+_HALL = ("zone_hottest_highest", "unit_speed_highest", "unit_speed_mean")
+
 AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
     "agent_ls": AgentDefinition(
-        command="load",
+        part="load",
+        commands=("load", "placement"),
         features=(*_CLOCK, "workload", *_QUEUE, *_CI, "ci_change", *_OUTDOOR, "soc"),
         scales={
             "default": {"work_carbon": 10.0, "cooling_carbon": 10.0, "sla": 20.0},
@@ -58,7 +75,9 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         },
     ),
     "agent_dc": AgentDefinition(
-        command="cooling",
+        part="cooling",
+        commands=("cooling", "fan", "placement"),
+        also_controlled=("chilled_water",),
         features=(*_CLOCK, "workload", *_CI, *_WEATHER, *_AIR, "it_energy", "hvac_energy"),
         scales={
             "default": {"cooling_carbon": 10.0, "hot_inlets": 0.1},
@@ -67,7 +86,8 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         },
     ),
     "agent_bat": AgentDefinition(
-        command="battery",
+        part="battery",
+        commands=("battery",),
         features=(*_CLOCK, *_CI, "ci_change", "dc_load", "soc"),
         scales={
             "default": {"battery_carbon": 10.0},
@@ -75,8 +95,28 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
             "paper": {"carbon": 1.0},
         },
     ),
+    "agent_geo": AgentDefinition(
+        part="geo",
+        commands=("transfer",),
+        features=(*_CLOCK, "workload", "queue", *_CI, *_OTHER_SITES),
+        scales={"default": {"geo_carbon": 10.0}, "bill": {}, "paper": {"carbon": 1.0}},
+    ),
+    "crac": AgentDefinition(
+        part="cooling",
+        commands=("fan", "cooling"),
+        features=(*_OWN_UNIT, "chilled_water", "time_of_day"),
+        scales={"default": {"zone_power": 1.0, "zone_heat": 0.2}},
+        per_unit=True,
+    ),
+    "plant": AgentDefinition(
+        part="cooling",
+        commands=("cooling", "chilled_water"),
+        features=("outdoor", "wet_bulb", "dc_load", *_HALL, "setpoint_mean", "chilled_water"),
+        scales={"default": {"hall_power": 1.0, "hall_heat": 0.2}},
+        also_controlled=("placement",),
+    ),
 }
-"""Definitions of all agents by name.
+"""Definitions of all groups by name.
 
 The default features are the lists of the paper (A.1.2, A.2.4, A.3.3) with three additions: queue
 ages and weather for the load agent, arriving work for the cooling agent, and the change of the
@@ -89,20 +129,36 @@ divided by their values at the design point.
 """
 
 
+ALL_AGENTS: tuple[str, ...] = tuple(AGENT_DEFINITIONS)
+"""Names of all groups, in the order of their actions and observations in joint environments."""
+
+
+def present_agents(agents: Sequence[str]) -> tuple[str, ...]:
+    """Return the groups that exist beside those that learn, and these, in order.
+
+    ``crac`` and ``plant`` take the place of ``agent_dc`` where one of them learns.
+
+    Args:
+        agents: names of the groups that learn.
+    """
+    absent = ("agent_dc",) if set(agents) & set(HALL_AGENTS) else HALL_AGENTS
+    return tuple(agent for agent in ALL_AGENTS if agent in agents or agent not in absent)
+
+
 def commands_by_others(
     agents: Sequence[str], decided: Sequence[str], offered: Sequence[str]
 ) -> list[str]:
     """Return the names of the commands that a controller sets for the agents that do not learn.
 
     Args:
-        agents: names of the agents that learn.
+        agents: names of the groups that learn.
         decided: names of the commands that the learning agents decide.
         offered: names of all commands that the controller can set.
     """
     settable = dict.fromkeys(
         command
-        for agent, definition in AGENT_DEFINITIONS.items()
+        for agent in present_agents(agents)
         if agent not in agents
-        for command in definition.controlled
+        for command in AGENT_DEFINITIONS[agent].controlled
     )
     return [command for command in settable if command in offered and command not in decided]

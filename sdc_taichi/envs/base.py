@@ -21,6 +21,7 @@ from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.images import RENDER_MODES, Image, check_render_mode, frame
 from sdc_taichi.envs.options import (
+    ConfigDraw,
     ConfigSource,
     EnvOptions,
     Overrides,
@@ -66,7 +67,8 @@ class Environment:
 
         Args:
             config: a preset, a file, a config or a dict of its sections. A batch also takes a list
-                of configs or dicts; environment i uses entry i modulo the length of the list.
+                of configs or dicts; environment i uses entry i modulo the length of the list. A
+                function of a random generator draws a config for each environment and episode.
             num_envs: number of environments; None creates one per config.
             only_agent: the learning agent of an environment with a single agent; None otherwise.
             overrides: values that replace those of every config: a dict from section.key to value,
@@ -82,8 +84,9 @@ class Environment:
         """
         check_render_mode(render_mode)
         configs, chosen = configs_and_options(config, overrides, options, keywords, only_agent)
-        if isinstance(self, SingleEnv) and len(configs) != 1:
-            raise ConfigError(f"config: {len(configs)} data centers; valid is one, or vector_env")
+        number = 1 if isinstance(configs, ConfigDraw) else len(configs)
+        if isinstance(self, SingleEnv) and number != 1:
+            raise ConfigError(f"config: {number} data centers; valid is one, or vector_env")
         batched = isinstance(self, BatchEnv)
         self.core = Core(configs, chosen, num_envs, precision, recorder, clip_actions=batched)
         self.render_mode = render_mode
@@ -152,7 +155,10 @@ class BatchEnv(Environment):
 
 
 class AgentSpaces:
-    """Observation and action spaces by agent, as in PettingZoo."""
+    """Observation and action spaces by agent, as in PettingZoo.
+
+    Batches have the spaces of groups, which are those of each of their agents.
+    """
 
     observation_spaces: dict[str, spaces.Space[Any]]
     """Space of the observations of one environment, by agent."""
@@ -205,9 +211,21 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
     return values.get("start_day")
 
 
-def as_scalars(by_name: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    """Convert the arrays of a batch of one environment, (1,) each, to numbers and text."""
-    return {name: values.item() for name, values in by_name.items()}
+def as_scalars(by_name: Mapping[str, npt.NDArray[Any]], site: int | None = None) -> dict[str, Any]:
+    """Convert the arrays of a batch of one environment, (1,) each, to numbers and text.
+
+    Args:
+        by_name: arrays by name; those of the sites of a fleet are (1, S).
+        site: index of the site whose values are returned; None returns those of all sites, (S,).
+    """
+    return {
+        name: values.item() if values.ndim == 1 else _of_site(values[0], site)
+        for name, values in by_name.items()
+    }
+
+
+def _of_site(values: npt.NDArray[Any], site: int | None) -> Any:
+    return values if site is None else values[site].item()
 
 
 def first_of_batch(observation: Observation) -> Observation:
@@ -215,6 +233,16 @@ def first_of_batch(observation: Observation) -> Observation:
     if isinstance(observation, dict):
         return {name: values[0] for name, values in observation.items()}
     return np.asarray(observation[0])
+
+
+def agent_part(values: Any, agent: int) -> Any:
+    """Return the part of one agent in the values of a group, whose first axis is the agent.
+
+    The agents of a group share the heat map.
+    """
+    if isinstance(values, dict):
+        return {**values, "features": values["features"][agent]}
+    return values[agent]
 
 
 class HasSpec:

@@ -211,6 +211,7 @@ COMMAND_LIMITS = {
     "placement": (1.0 / PLACEMENT_FACTOR, PLACEMENT_FACTOR),
     "battery": (-1.0, 1.0),
     "chilled_water": (FREEZING_C, BOILING_C),
+    "transfer": (0.0, 1.0),
 }
 """Minimum and maximum of each command of an agent or a controller, by field of ``Actions``."""
 
@@ -232,8 +233,8 @@ class SavedState:
     peaks_kw: F64
     """Highest billed power of the episode, before and after the last step, in kW, (2, B)."""
     commands: dict[str, F64] | None
-    """Commands of the last step by field of ``Actions``, (), (B,), (U,) or (R,) each; None before
-    the first step."""
+    """Commands of the last step by field of ``Actions``, (), (B,), (U,), (R,) or (B, S) each; None
+    before the first step."""
 
 
 def check_state(
@@ -242,6 +243,7 @@ def check_state(
     options: Mapping[str, Any],
     inputs: DrawnInputs | None,
     sim: Simulator,
+    num_envs: int,
     learned: Sequence[str],
     by_others: Sequence[str],
     steps: int,
@@ -253,6 +255,7 @@ def check_state(
         options: plain values that identify the environments.
         inputs: source of drawn years and traces; None if episodes do not draw their inputs.
         sim: simulator of the environments.
+        num_envs: number of environments, which differs from that of data centers with fleets.
         learned: names of the commands of learning agents; every step sets all of them.
         by_others: names of the commands that the controller ``others`` may set.
         steps: number of steps of an episode.
@@ -263,9 +266,9 @@ def check_state(
     try:
         parts = {name: values[name] for name in PARTS}
         _check_options(parts["options"], options)
-        if len(parts["generators"]) != sim.size:
+        if len(parts["generators"]) != num_envs:
             raise SdcError(
-                f"state: made by {len(parts['generators'])} environments; valid is {sim.size}"
+                f"state: made by {len(parts['generators'])} environments; valid is {num_envs}"
             )
         draw = drivers = None
         if inputs is not None:
@@ -290,6 +293,19 @@ def check_state(
     if done > steps:
         raise SdcError(f"state: {done} steps; valid is at most {steps}, the episode")
     return saved
+
+
+def config_keys_of(values: Any, num_envs: int) -> I64:
+    """Return the random keys of the drawn configs in a saved state, (E,).
+
+    Raises:
+        SdcError: the state has no such keys, because its environments did not draw configs.
+    """
+    keys = values.get("configs") if isinstance(values, Mapping) else None
+    if keys is None:
+        raise SdcError("state: made by environments that draw no configs; valid is one of those")
+    checked: I64 = _checked("configs", keys, np.int64, [(num_envs,)], 0, 2**63 - 1)
+    return checked
 
 
 def _check_options(made: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
@@ -320,18 +336,23 @@ def _checked_commands(
     if saved is None:
         return None
     names = [*learned, *by_others]
-    optional = {"cooling", "placement", "chilled_water"}.intersection(by_others)
+    optional = {"cooling", "placement", "chilled_water", "transfer"}.intersection(by_others)
     if not set(names) - optional <= set(saved) <= set(names):
         raise SdcError(
             f"state: actions are {shortened(sorted(saved))}; valid is a dict of {sorted(names)}"
         )
-    of_parts = {"cooling": fleet.units, "fan": fleet.units, "placement": fleet.racks}
+    of_parts: dict[str, tuple[int, ...]] = {
+        "cooling": (fleet.units,),
+        "fan": (fleet.units,),
+        "placement": (fleet.racks,),
+        "transfer": (fleet.size, fleet.sites_per_fleet),
+    }
     return {
         name: _checked(
             f"actions of {name}",
             saved[name],
             np.float64,
-            [(), (fleet.size,), (of_parts.get(name, fleet.size),)],
+            [(), (fleet.size,), of_parts.get(name, (fleet.size,))],
             *COMMAND_LIMITS[name],
         )
         for name in names

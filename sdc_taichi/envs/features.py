@@ -5,9 +5,9 @@ is scaled to ``v / high``, -1..1. Values outside the range are clipped. Features
 information about the future except forecasts and the demand of the coming step.
 
 To add a feature, write a function in this module. Its argument is ``TimeInputs``, ``Measurements``
-or, for features with an entry per rack, the ``View``. The function's name is the name of the
-feature, its docstring is the description in the documentation, and its decorator sets unit and
-range. No other module needs a change.
+or, for features that exist only in some environments and for those of CRAC units, the ``View``. The
+function's name is the name of the feature, its docstring is the description in the documentation,
+and its decorator sets unit and range. No other module needs a change.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from gymnasium.spaces import Box
 from pydantic import Field
 
 from sdc_taichi.control.view import View, mean_setpoint_c
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, ALL_AGENTS
+from sdc_taichi.envs.site_order import cleaner_first
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
-from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
 from sdc_taichi.types import F32, F64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
@@ -88,6 +89,12 @@ class Layout:
     """Number of CRAC fans whose speeds agents decide; 0 if agents do not control fans."""
     racks: int = 0
     """Number of racks on which agents place work; 0 if agents do not place work."""
+    hall: int = 0
+    """1 if agents ``crac`` or ``plant`` learn, else 0."""
+    neighbours: int = 0
+    """Number of neighbouring CRAC units that an agent ``crac`` observes."""
+    other_sites: int = 0
+    """Number of other sites of a fleet if ``agent_geo`` learns, else 0."""
 
 
 DEFAULT_LAYOUT = Layout()
@@ -177,7 +184,8 @@ _Kind = dict[str, tuple[Feature, _Size]]
 """Features whose functions share one type of argument, by name, each with its declared size."""
 _TIME: _Kind = {}
 _MEASURED: _Kind = {}
-_OF_RACKS: _Kind = {}
+_OF_VIEW: _Kind = {}
+_OF_UNITS: _Kind = {}
 
 
 def _feature(
@@ -224,14 +232,19 @@ def measured_features(layout: Layout) -> tuple[Feature, ...]:
     return _features_of(_MEASURED, layout)
 
 
-def rack_features(layout: Layout) -> tuple[Feature, ...]:
-    """Return the features with an entry per rack: functions of the view, not compiled."""
-    return _features_of(_OF_RACKS, layout)
+def view_features(layout: Layout) -> tuple[Feature, ...]:
+    """Return the features of data centers that are functions of the view, not compiled."""
+    return _features_of(_OF_VIEW, layout)
+
+
+def unit_features(layout: Layout) -> tuple[Feature, ...]:
+    """Return the features of CRAC units: functions of the view, not compiled, (size, U)."""
+    return _features_of(_OF_UNITS, layout)
 
 
 def all_features(layout: Layout = DEFAULT_LAYOUT) -> tuple[Feature, ...]:
-    """Return all features in the order of the shared state."""
-    return (*time_features(layout), *measured_features(layout), *rack_features(layout))
+    """Return all features of data centers in the order of the shared state."""
+    return (*time_features(layout), *measured_features(layout), *view_features(layout))
 
 
 def _ci_leads(layout: Layout) -> int:
@@ -412,7 +425,7 @@ def fan_speed(m: Measurements) -> list[F64]:
     return m.fan_speeds
 
 
-@_feature(_OF_RACKS, "C", 10.0, 50.0, lambda x: x.racks)
+@_feature(_OF_VIEW, "C", 10.0, 50.0, lambda x: x.racks)
 def rack_inlets(view: View) -> F64:
     """Hottest inlet temperature of each rack in the last step."""
     if view.last is None:
@@ -420,10 +433,165 @@ def rack_inlets(view: View) -> F64:
     return np.asarray(view.last.rack_inlet_max_c.reshape(view.size, -1).T)
 
 
+def _of_hall(layout: Layout) -> int:
+    return layout.hall
+
+
+@_feature(_OF_VIEW, "C", 5.0, 30.0, _of_hall)
+def chilled_water(view: View) -> F64:
+    """Temperature of the chilled water in the last step."""
+    water_c = mean_setpoint_c(view) if view.last is None else view.last.chilled_water_c
+    return np.asarray(water_c[None])
+
+
+@_feature(_OF_VIEW, "C", 10.0, 30.0, _of_hall)
+def setpoint_mean(view: View) -> F64:
+    """Supply-air setpoint, mean over the CRAC units."""
+    return mean_setpoint_c(view)[None]
+
+
+@_feature(_OF_VIEW, "C", 15.0, 40.0, _of_hall)
+def zone_hottest_highest(view: View) -> F64:
+    """Highest `zone_hottest` of the CRAC units that run."""
+    return _highest_of_running(view, view.zone_hottest_c)
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, _of_hall)
+def unit_speed_highest(view: View) -> F64:
+    """Highest `unit_speed` of the CRAC units that run."""
+    return _highest_of_running(view, view.state.fan_speed)
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, _of_hall)
+def unit_speed_mean(view: View) -> F64:
+    """Mean `unit_speed` of the CRAC units that run."""
+    running = view.fleet.unit_sums(view.unit_running)
+    speeds = view.fleet.unit_sums(view.state.fan_speed * view.unit_running)
+    return np.asarray((speeds / np.maximum(running, 1.0))[None])
+
+
+@_feature(_OF_UNITS, "share", 0.0, 1.0)
+def unit_speed(view: View) -> F64:
+    """Speed of the own fan, relative to full speed."""
+    return view.state.fan_speed[None]
+
+
+@_feature(_OF_UNITS, "C", 10.0, 35.0)
+def unit_supply(view: View) -> F64:
+    """Supply-air temperature of the own unit in the last step."""
+    supply_c = view.state.setpoint_c if view.last is None else view.last.unit_supply_c
+    return np.asarray(supply_c[None])
+
+
+@_feature(_OF_UNITS, "C", 15.0, 60.0)
+def unit_return(view: View) -> F64:
+    """Temperature of the air that returns to the own unit; in quasi-steady halls to all units."""
+    own_c = view.state.return_air_c
+    if not len(own_c):
+        of_hall_c = mean_setpoint_c(view) if view.last is None else view.last.return_c
+        own_c = of_hall_c[view.fleet.unit_dc]
+    return own_c[None]
+
+
+@_feature(_OF_UNITS, "share", 0.0, 1.0)
+def unit_running(view: View) -> F64:
+    """1 if the own unit ran in the last step, 0 if it was down."""
+    return view.unit_running[None]
+
+
+@_feature(_OF_UNITS, "C", 15.0, 40.0)
+def zone_hottest(view: View) -> F64:
+    """Hottest inlet of the own zone in the last step, with the error of its sensors."""
+    return view.zone_hottest_c[None]
+
+
+@_feature(_OF_UNITS, "C", 15.0, 40.0)
+def zone_mean(view: View) -> F64:
+    """Mean inlet temperature of the own zone in the last step, with the error of its sensors."""
+    return view.zone_mean_c[None]
+
+
+@_feature(_OF_UNITS, "1", 0.0, 2.0)
+def tile_pressure(view: View) -> F64:
+    """Supply air of the own zone divided by the supply air that its racks need."""
+    return view.zone_supply_ratio[None]
+
+
+@_feature(_OF_UNITS, "1", 0.0, 1.0, lambda x: 2 * x.neighbours)
+def neighbours(view: View) -> F64:
+    """`unit_speed` and scaled `zone_hottest` of each of the nearest units, nearest first."""
+    nearest, (hottest, _) = view.nearest_units, _OF_UNITS["zone_hottest"]
+    inlets = scale(view.zone_hottest_c.astype(np.float32), hottest)
+    pairs = np.stack([view.state.fan_speed[nearest], inlets[nearest]], axis=1)
+    return pairs.reshape(-1, pairs.shape[-1])
+
+
+SITE_LEADS_H = (6.0, 24.0)
+"""Leads of the forecast of the carbon intensity of other sites, in h."""
+
+
+@_feature(_OF_VIEW, "g/kWh", 0.0, 1000.0, lambda x: x.other_sites)
+def site_ci(view: View) -> F64:
+    """CI of the other sites in the coming step, cleanest first."""
+    return _of_others(view, view.now.ci_g_per_kwh)
+
+
+@_feature(_OF_VIEW, "g/kWh", 0.0, 1000.0, lambda x: len(SITE_LEADS_H) * x.other_sites)
+def site_ci_forecast(view: View) -> F64:
+    """Forecasts of the CI of the other sites in 6 and 24 h, in the order of `site_ci`."""
+    ahead = [round(lead_h / view.step_h) for lead_h in SITE_LEADS_H]
+    forecast = view.forecast(SITE_LEADS_H[-1] + view.step_h).ci_g_per_kwh
+    return np.concatenate([_of_others(view, forecast[:, lead]) for lead in ahead])
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: x.other_sites)
+def site_room(view: View) -> F64:
+    """Room for work at the other sites, as a share of a full queue, in the order of `site_ci`."""
+    limit_h = view.fleet.values("workload.queue_limit_h")
+    limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
+    waiting = view.state.queue[:, -1] + view.state.in_flight.sum(axis=1)
+    return _of_others(view, 1.0 - waiting * view.step_h / (limit_h * TASKS_PER_STEP))
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: min(x.other_sites, 1))
+def site_link(view: View) -> F64:
+    """Most work that the own site can send in a step, as a share of its capacity."""
+    assert view.fleet.shared_work is not None
+    return view.fleet.shared_work.link_tasks[None] / TASKS_PER_STEP
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: 3 * min(x.other_sites, 1))
+def transfers(view: View) -> F64:
+    """Work sent, landed and refused in the last step, as shares of the capacity of a step."""
+    if view.last is None:
+        return np.zeros((3, view.size))
+    last = view.last
+    tasks = np.stack([last.sent_tasks, last.landed_tasks, last.refused_tasks])
+    return np.asarray(tasks / TASKS_PER_STEP)
+
+
+def _of_others(view: View, of_sites: F64) -> F64:
+    """Return values of the other sites, that with the cleanest grid first, (S - 1, B)."""
+    sites = view.fleet.sites_per_fleet
+    first = np.repeat(np.arange(0, view.size, sites), sites)[:, None]
+    return np.asarray(of_sites[first + cleaner_first(view)].T)
+
+
+def _highest_of_running(view: View, per_unit: F64) -> F64:
+    """Return the highest value of the units that run, of all units if none runs, (1, B)."""
+    first = view.fleet.unit_offsets[:-1]
+    running = np.where(view.unit_running > 0, per_unit, -np.inf)
+    highest = np.maximum.reduceat(running, first)
+    return np.where(np.isinf(highest), np.maximum.reduceat(per_unit, first), highest)[None]
+
+
 def features_by_agent(
     chosen: Mapping[str, Sequence[str]] | None,
     known: Sequence[Feature],
     commands: Mapping[str, Sequence[str]] | None = None,
+    *,
+    agents: Sequence[str] = AGENTS,
+    of_units: Sequence[Feature] = (),
 ) -> dict[str, tuple[Feature, ...]]:
     """Return the features that each agent observes.
 
@@ -432,8 +600,10 @@ def features_by_agent(
 
     Args:
         chosen: names of features by agent; None gives all agents their default features.
-        known: all features.
+        known: all features of data centers.
         commands: commands that agents decide, by agent; None means the default commands.
+        agents: names of the agents that observe.
+        of_units: all features of CRAC units, which agents of CRAC units can observe too.
 
     Raises:
         ConfigError: an agent or feature is unknown, a feature is named twice, or an agent has no
@@ -441,15 +611,18 @@ def features_by_agent(
     """
     chosen = chosen or {}
     for agent in chosen:
-        if agent not in AGENTS:
+        if agent not in AGENT_DEFINITIONS:
             raise ConfigError(
-                f"features: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
+                f"features: unknown agent {agent!r}{suggestion_or_valid(agent, AGENT_DEFINITIONS)}"
             )
-    by_name = {feature.name: feature for feature in known}
     out: dict[str, tuple[Feature, ...]] = {}
-    for agent in AGENTS:
+    for agent in agents:
+        of_agent = (*known, *of_units) if AGENT_DEFINITIONS[agent].per_unit else known
+        by_name = {feature.name: feature for feature in of_agent}
         acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
         default = [n for n in (*AGENT_DEFINITIONS[agent].features, *acted_on) if n in by_name]
+        if AGENT_DEFINITIONS[agent].per_unit:
+            default = [n for n in default if n != "fan_speed"]
         names = chosen.get(agent, default)
         if isinstance(names, str) or not names:
             raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")
@@ -509,12 +682,25 @@ def entries_of_new_features(
 
 def features_markdown() -> str:
     """Return the Markdown table of features for docs/observations.md; dots mark the defaults."""
+    titles = ("load", "cooling", "battery")
+    return _markdown(all_features(), dict(zip(titles, AGENTS, strict=True)))
+
+
+def group_features_markdown() -> str:
+    """Return the Markdown table of the features of ``crac``, ``plant`` and ``agent_geo``."""
+    layout = Layout(hall=1, neighbours=1, other_sites=1)
+    of_view = [*view_features(layout), *unit_features(layout)]
+    return _markdown(of_view, {name: name for name in ALL_AGENTS[len(AGENTS) :]})
+
+
+def _markdown(features: Sequence[Feature], agents: Mapping[str, str]) -> str:
+    """Return the Markdown table of features, with a column for each agent, by its title."""
     lines = [
-        "| feature | entries | what it is | unit | range | load | cooling | battery |",
-        "|---|---|---|---|---|---|---|---|",
+        f"| feature | entries | what it is | unit | range | {' | '.join(agents)} |",
+        f"|{'---|' * (5 + len(agents))}",
     ]
-    for f in all_features():
-        seen = ["●" if f.name in a.features else " " for a in AGENT_DEFINITIONS.values()]
+    for f in features:
+        seen = ["●" if f.name in AGENT_DEFINITIONS[a].features else " " for a in agents.values()]
         cells = (f"`{f.name}`", str(f.size), f.description, f.unit, f"{f.low:g}..{f.high:g}", *seen)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -3,7 +3,7 @@
 Module ``features`` defines how a feature follows from its inputs. The observer computes all
 features once per view, by three methods. Entries that depend on time alone are copied from shared
 rows (``time_rows``). Entries measured in the data center come from one compiled stage. Entries of
-single racks are computed with NumPy.
+single racks and CRAC units are computed with NumPy.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.control.view import View, mean_setpoint_c
-from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, HALL_AGENTS
 from sdc_taichi.envs.features import (
     AGE_EDGES_H,
     CI_LEADS_H,
     UNLIMITED_QUEUE_H,
     WEATHER_LEADS_H,
     Design,
+    Feature,
     Layout,
     Measurements,
     all_features,
@@ -28,13 +30,15 @@ from sdc_taichi.envs.features import (
     features_by_agent,
     features_space,
     measured_features,
-    rack_features,
     scale,
     time_features,
+    unit_features,
+    view_features,
 )
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.time_rows import Forecasts, TimeRows
+from sdc_taichi.envs.unit_slots import UnitSlots
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
@@ -44,7 +48,8 @@ from sdc_taichi.types import F32, F64, I64
 class Observer:
     """Computes the observation of each agent, and the shared state, for a fleet.
 
-    Forecasts have the forecast errors of the view.
+    Forecasts have the forecast errors of the view. The shared state concatenates all features of
+    the data center and, if agents of CRAC units observe, all features of each unit, unit by unit.
 
     Args:
         fleet: the B data centers.
@@ -54,11 +59,13 @@ class Observer:
         weather_leads_h: leads of the weather forecasts, in h; increasing multiples of the step.
         new_inputs: True if inputs may differ from episode to episode.
         commands: commands that agents decide, by agent; None means the default commands.
+        neighbours: number of neighbouring CRAC units that an agent of a unit observes.
+        slots: places of CRAC units in the observations of their agents; None means as few as fit.
 
     Attributes:
         features: features of each agent, in the order of its observation.
         spaces: observation space of each agent.
-        state_features: all features, in the order of the shared state.
+        state_features: all features of data centers, in the order of the shared state.
         state_space: space of the shared state.
 
     Raises:
@@ -75,13 +82,17 @@ class Observer:
         weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
         new_inputs: bool = False,
         commands: Mapping[str, Sequence[str]] | None = None,
+        neighbours: int = 0,
+        slots: UnitSlots | None = None,
     ) -> None:
         forecasts = Forecasts(
             fleet.steps_per_hour, ci_leads_h=ci_leads_h, weather_leads_h=weather_leads_h
         )
         units = np.diff(fleet.unit_offsets)
         self._equal_units = bool(np.all(units == units[0]))
-        decided = {name for names in (commands or {}).values() for name in names}
+        of_dcs = [agent for agent in agents if not AGENT_DEFINITIONS[agent].per_unit]
+        of_units = [agent for agent in agents if AGENT_DEFINITIONS[agent].per_unit]
+        decided = {name for agent in of_dcs for name in (commands or {}).get(agent, ())}
         count = int(units[0]) if self._equal_units else 1
         self._layout = layout = Layout(
             ci_leads_h,
@@ -89,20 +100,35 @@ class Observer:
             units=count,
             fans=count if "fan" in decided else 0,
             racks=int(fleet.rack_offsets[1]) if "placement" in decided else 0,
+            hall=int(not set(agents).isdisjoint(HALL_AGENTS)),
+            neighbours=neighbours,
+            other_sites=fleet.sites_per_fleet - 1 if "agent_geo" in agents else 0,
         )
         of_time, self._measured = time_features(layout), measured_features(layout)
-        self._of_racks = rack_features(layout)
+        self._of_view = view_features(layout)
         self.state_features = all_features(layout)
-        self.state_space = features_space(self.state_features)
-        self.features = features_by_agent(features, self.state_features, commands)
+        self._of_units = unit_features(layout) if of_units else ()
+        self._slots = UnitSlots(fleet) if slots is None else slots
+        self.state_space = features_space(
+            (*self.state_features, *self._slots.width * self._of_units)
+        )
+        self.features = features_by_agent(
+            features, self.state_features, commands, agents=agents, of_units=self._of_units
+        )
         self.spaces = {agent: features_space(x) for agent, x in self.features.items()}
 
         slices, self._time_width = feature_slices(self.state_features), sum(f.size for f in of_time)
         entries = np.arange(sum(f.size for f in self.state_features))
+        # Features of units, which follow those of data centers, are added by ``observe``.
         columns = {
-            agent: np.concatenate([entries[slices[f.name]] for f in self.features[agent]])
+            agent: np.concatenate(
+                [entries[slices[f.name]] for f in self.features[agent] if f.name in slices]
+                or [entries[:0]]
+            )
             for agent in agents
         }
+        self._in_observation = {a: _entries_of_units(self.features[a], slices) for a in of_units}
+        self._unit_slices = feature_slices(self._of_units)
         # Measured entries first receive an arbitrary time entry, which ``observe`` overwrites.
         from_rows = {a: np.where(c < self._time_width, c, 0) for a, c in columns.items()}
         self._runs = {agent: _runs(c - self._time_width) for agent, c in columns.items()}
@@ -134,6 +160,8 @@ class Observer:
     def observe(self, view: View) -> dict[str, F32]:
         """Return the observation of each agent before the coming step, (B, n) each.
 
+        Those of agents of CRAC units are (B, W, n), with the slots of ``UnitSlots``.
+
         ``reset`` must have been called.
         """
         entries = self._entries_of(view)
@@ -142,6 +170,17 @@ class Observer:
             observations[agent] = out = entries.arranged[agent].take(entries.row_numbers, axis=0)
             for places, source in runs:
                 out[:, places] = entries.measured[source].T
+        for agent, columns in self._in_observation.items():
+            of_dc, features = observations[agent], self.features[agent]
+            out = np.empty((*self._slots.exists.shape, len(columns)), dtype=np.float32)
+            out[..., ~columns] = of_dc[:, None]
+            chosen = [
+                entries.of_units[self._unit_slices[f.name]]
+                for f in features
+                if f.name in self._unit_slices
+            ]
+            out[..., columns] = np.moveaxis(np.concatenate(chosen), 0, -1)
+            observations[agent] = out
         return observations
 
     def state(self, view: View) -> F32:
@@ -150,16 +189,27 @@ class Observer:
         ``reset`` must have been called.
         """
         entries, width = self._entries_of(view), self._time_width
-        out = np.empty((view.size, width + len(entries.measured)), dtype=np.float32)
+        end = width + len(entries.measured)
+        out = np.empty((view.size, *(self.state_space.shape or ())), dtype=np.float32)
         out[:, :width] = entries.time.take(entries.row_numbers, axis=0)
-        out[:, width:] = entries.measured.T
+        out[:, width:end] = entries.measured.T
+        if self._of_units:
+            out[:, end:] = np.moveaxis(entries.of_units, 0, -1).reshape(view.size, -1)
         return out
 
     def _entries_of(self, view: View) -> _Entries:
         """Return the entries of all features in a view, from a cache if the view is the same."""
         if self._entries is None or self._entries.view is not view:
-            self._entries = _Entries(view, *self._time.rows(view), self._measure(view))
+            measured, of_units = self._measure(view), self._measure_units(view)
+            self._entries = _Entries(view, *self._time.rows(view), measured, of_units)
         return self._entries
+
+    def _measure_units(self, view: View) -> F32:
+        """Compute the scaled entries of all features of CRAC units, (m, B, W)."""
+        rows = [scale(f.value(view)[: f.size].astype(np.float32), f) for f in self._of_units]
+        if not rows:
+            return np.zeros((0, 0, 0), dtype=np.float32)
+        return self._slots.fill(np.concatenate(rows))
 
     def _measure(self, view: View) -> F32:
         """Compute the scaled entries measured in the data center, (m, B), a contiguous row each."""
@@ -177,10 +227,10 @@ class Observer:
             inputs |= {f"fan_{i}": speed for i, speed in enumerate(speeds)}
         last = _AtRest(view) if view.last is None else view.last
         measured: F32 = self._stage.rows(last=last, **inputs).astype(np.float32)
-        if not self._of_racks:
+        if not self._of_view:
             return measured
-        of_racks = [scale(f.value(view).astype(np.float32), f) for f in self._of_racks]
-        return np.concatenate([measured, *of_racks])
+        of_view = [scale(f.value(view).astype(np.float32), f) for f in self._of_view]
+        return np.concatenate([measured, *of_view])
 
     def _compile(self, view: View) -> None:
         """Compile the stage that maps the inputs from ``_measure`` to scaled entries."""
@@ -225,6 +275,8 @@ class _Entries(NamedTuple):
     """Index into ``time`` of the row of each data center, (B,)."""
     measured: F32
     """Entries that do not depend on time alone, (m, B)."""
+    of_units: F32
+    """Entries of CRAC units, (m, B, W); empty if no agent of a CRAC unit observes."""
 
 
 class _AtRest:
@@ -241,7 +293,11 @@ class _AtRest:
 
 
 def make_observer(
-    fleet: Fleet, options: EnvOptions, *, new_inputs: bool = False
+    fleet: Fleet,
+    options: EnvOptions,
+    *,
+    new_inputs: bool = False,
+    slots: UnitSlots | None = None,
 ) -> Observer | ReleasedObserver:
     """Create the observer of the agents that learn.
 
@@ -249,6 +305,7 @@ def make_observer(
         fleet: the data centers.
         options: environment options, among them features and leads.
         new_inputs: True if inputs may differ from episode to episode.
+        slots: places of CRAC units in observations; None means as few as fit.
 
     Raises:
         ConfigError: features or leads do not fit the data centers.
@@ -263,7 +320,21 @@ def make_observer(
         weather_leads_h=options.weather_leads_h,
         new_inputs=new_inputs,
         commands={agent: options.commands_of(agent) for agent in options.agents},
+        neighbours=options.neighbours,
+        slots=slots,
     )
+
+
+def _entries_of_units(
+    features: Sequence[Feature], of_dc: Mapping[str, slice]
+) -> npt.NDArray[np.bool_]:
+    """Return True for the entries of an observation that belong to features of CRAC units, (n,).
+
+    Args:
+        features: features of the observation, in order.
+        of_dc: the features of data centers, by name.
+    """
+    return np.repeat([f.name not in of_dc for f in features], [f.size for f in features])
 
 
 def _runs(sources: I64) -> list[tuple[slice, slice]]:

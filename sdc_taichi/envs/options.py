@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -25,9 +25,9 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.config.electrical_schema import TariffConfig
-from sdc_taichi.control import check_controller
+from sdc_taichi.control import check_controller, commands_of
 from sdc_taichi.control.view import PERFECT, ForecastError
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, Agent
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, ALL_AGENTS, HALL_AGENTS, Agent
 from sdc_taichi.envs.features import (
     CI_LEADS_H,
     WEATHER_LEADS_H,
@@ -36,6 +36,7 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
+from sdc_taichi.types import I64
 
 
 def _plain_int(value: Any) -> Any:
@@ -64,7 +65,7 @@ class EnvOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
-    """Agents that learn. The controller ``others`` commands all other agents."""
+    """Groups of agents that learn. The controller ``others`` commands all other agents."""
     others: Any = "idle"
     """Controller of the agents that do not learn. Valid are a name as on the command line, a list
     of parts such as ``load=name,cooling=name,battery=name``, or an object with the methods
@@ -79,8 +80,8 @@ class EnvOptions(BaseModel):
     commands: Mapping[str, tuple[str, ...]] | None = None
     """Commands that agents decide, by agent, in the order of the numbers in the action. agent_ls
     can decide ``load`` and ``placement``; agent_dc ``cooling``, ``fan`` and ``placement``;
-    agent_bat ``battery``. Agents that are left out decide ``load``, ``cooling`` and ``battery``,
-    respectively."""
+    agent_bat ``battery``; agent_geo ``transfer``; crac ``fan`` and ``cooling``; plant ``cooling``
+    and ``chilled_water``. Agents that are left out decide the first of these."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Change of the setpoint in one step at a continuous action of 1, in K. This is the largest
     change."""
@@ -117,6 +118,9 @@ class EnvOptions(BaseModel):
     """Leads of the weather forecasts, in h."""
     forecast_error: ForecastError = PERFECT
     """Errors of the forecasts of carbon intensity and weather."""
+    neighbours: Annotated[int, Field(strict=True, ge=0, le=8), PLAIN_INT] = 0
+    """Number of neighbouring CRAC units whose fan speeds and hottest inlets an agent ``crac``
+    observes, 0..8."""
     heat_map: bool = False
     """True if every observation is a dict of features and an image of the hall."""
     rewards: Any = "default"
@@ -125,8 +129,8 @@ class EnvOptions(BaseModel):
     name (``register_reward``) or by its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
     """Weight a, 0..1, of an agent's individual reward in the reward that the agent receives. The
-    individual rewards of the other two agents have the weight (1 - a)/2 each (paper, section 4.5).
-    1 means no collaboration."""
+    individual rewards of the N - 1 other agents have the weight (1 - a)/(N - 1) each (paper,
+    section 4.5, with three agents). 1 means no collaboration."""
     tariff: TariffConfig | None = None
     """Electricity tariff that replaces the tariff of all configs; None keeps theirs."""
     costs: Any = None
@@ -156,8 +160,8 @@ class EnvOptions(BaseModel):
     @classmethod
     def _commands_of_agents(cls, value: Any) -> Any:
         for agent, names in (value or {}).items():
-            if agent not in AGENTS:
-                raise ValueError(f"unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}")
+            if agent not in ALL_AGENTS:
+                raise ValueError(f"unknown agent {agent!r}{suggestion_or_valid(agent, ALL_AGENTS)}")
             valid = AGENT_DEFINITIONS[agent].commands
             for name in names:
                 if name not in valid:
@@ -174,7 +178,7 @@ class EnvOptions(BaseModel):
     @field_validator("agents")
     @classmethod
     def _in_order(cls, value: tuple[Agent, ...]) -> tuple[Agent, ...]:
-        return tuple(sorted(value, key=AGENTS.index))
+        return tuple(sorted(value, key=ALL_AGENTS.index))
 
     @model_validator(mode="after")
     def _options_fit_each_other(self) -> Self:
@@ -184,14 +188,24 @@ class EnvOptions(BaseModel):
                 raise ValueError(f"{', '.join(unused)}: without effect {why}")
         for option in ("features", "commands"):
             for agent in getattr(self, option) or {}:
-                if agent in AGENTS and agent not in self.agents:
+                if agent in ALL_AGENTS and agent not in self.agents:
                     raise ValueError(
                         f"{option}: without effect for {agent}, which does not learn; valid for "
                         f"{', '.join(self.agents)}"
                     )
-        decided = [name for agent in self.agents for name in self.commands_of(agent)]
-        if decided.count("placement") > 1:
-            raise ValueError("commands: placement is decided by two agents; valid is one")
+        deciding: dict[str, str] = {}
+        for agent in self.agents:
+            for name in self.commands_of(agent):
+                if name in deciding:
+                    raise ValueError(
+                        f"commands: {name} is decided by {deciding[name]} and {agent}; valid is one"
+                    )
+                deciding[name] = agent
+        if self.observations == "sustaindc" and not set(self.agents) <= set(AGENTS):
+            raise ValueError(
+                f"observations sustaindc: are those of {', '.join(AGENTS)}; valid for others is "
+                "default"
+            )
         if self.start == "sampled" and not self.start_days():
             raise ValueError(
                 f"days {self.days}: no episode of that length lies in the months "
@@ -202,6 +216,8 @@ class EnvOptions(BaseModel):
     def _without_effect(self) -> list[tuple[tuple[str, ...], bool, str]]:
         """List conditions of options without effect: names, True if it applies, and the reason."""
         continuous = self.actions == "continuous"
+        cooling = ", ".join(a for a in self.agents if a in ("agent_dc", *HALL_AGENTS))
+        decided = [name for agent in self.agents for name in self.commands_of(agent)]
         shared = isinstance(self.rewards, Mapping) or (
             isinstance(self.rewards, str) and self.rewards in REWARD_SETS
         )
@@ -212,7 +228,11 @@ class EnvOptions(BaseModel):
                 "on observations sustaindc; valid with observations default",
             ),
             (("months",), self.start == "fixed", "with start fixed; valid with start sampled"),
-            (("others",), set(self.agents) == set(AGENTS), "as all agents learn; valid with fewer"),
+            (
+                ("others",),
+                set(self.agents) >= set(AGENTS) and not self._others_transfer(),
+                "as all agents learn; valid with fewer",
+            ),
             (("action_order",), continuous, "with actions continuous; valid with discrete"),
             (
                 ("action_order",),
@@ -226,18 +246,23 @@ class EnvOptions(BaseModel):
             ),
             (
                 ("setpoint_change_k", "fan_change"),
-                "agent_dc" not in self.agents,
+                not cooling,
                 "as agent_dc does not learn; valid where it does",
             ),
             (
                 ("setpoint_change_k",),
-                "cooling" not in self.commands_of("agent_dc"),
-                "without the command cooling of agent_dc; valid with it",
+                "cooling" not in decided,
+                f"without the command cooling of {cooling}; valid with it",
             ),
             (
                 ("fan_change",),
-                "fan" not in self.commands_of("agent_dc"),
-                "without the command fan of agent_dc; valid with it",
+                "fan" not in decided,
+                f"without the command fan of {cooling}; valid with it",
+            ),
+            (
+                ("neighbours",),
+                "crac" not in self.agents,
+                "as crac does not learn; valid where it does",
             ),
             (
                 ("collaboration",),
@@ -245,6 +270,12 @@ class EnvOptions(BaseModel):
                 "on a function's rewards; valid with rewards by name or a dict",
             ),
         ]
+
+    def _others_transfer(self) -> bool:
+        """True if the controller ``others`` moves work between the sites of a fleet."""
+        if isinstance(self.others, str):
+            return any(part.strip().startswith("geo") for part in self.others.split(","))
+        return "transfer" in commands_of(self.others)
 
     def commands_of(self, agent: str) -> tuple[str, ...]:
         """Return the commands that an agent decides if it learns, in the order of its action."""
@@ -282,12 +313,40 @@ def make_options(**values: Any) -> EnvOptions:
 
 OneConfig: TypeAlias = DataCenterConfig | Mapping[str, Any]
 """A config, or a dict of its sections as plain values."""
-ConfigSource: TypeAlias = str | os.PathLike[str] | OneConfig | Sequence[OneConfig]
+DrawFunction: TypeAlias = Callable[[np.random.Generator], OneConfig]
+"""Function that draws a config with a random generator. If agents of CRAC units learn, it has an
+attribute ``most_units``, the largest number of units of its halls."""
+ConfigSource: TypeAlias = str | os.PathLike[str] | OneConfig | Sequence[OneConfig] | DrawFunction
 """Name of a preset, a file, a config or a dict of its sections; for batches also a sequence of
-configs or dicts."""
+configs or dicts; or a function that draws a config for each environment and episode."""
 Overrides: TypeAlias = Mapping[str, Any] | Sequence[str]
 """Values that replace those of the config: a dict of section.key to value, or a list of
 ``section.key=value``."""
+
+
+class ConfigDraw:
+    """Draws the config of each environment and episode.
+
+    Args:
+        draw: function that draws a config.
+        overrides: values that replace those of every config.
+
+    Attributes:
+        most_units: largest number of CRAC units of a config; None if ``draw`` does not say.
+    """
+
+    def __init__(self, draw: DrawFunction, overrides: Overrides) -> None:
+        self._draw, self._overrides = draw, overrides
+        self.most_units: int | None = getattr(draw, "most_units", None)
+
+    def configs(self, keys: I64) -> list[DataCenterConfig]:
+        """Return the configs that belong to random keys, (E,).
+
+        Raises:
+            ConfigError: the function returned no config, or one that is not valid.
+        """
+        drawn = [self._draw(np.random.Generator(np.random.PCG64(int(key)))) for key in keys]
+        return [_with_overrides(_checked_config(one), self._overrides) for one in drawn]
 
 
 def configs_and_options(
@@ -296,11 +355,11 @@ def configs_and_options(
     options: EnvOptions | None,
     keywords: Mapping[str, Any],
     only_agent: str | None = None,
-) -> tuple[list[DataCenterConfig], EnvOptions]:
+) -> tuple[list[DataCenterConfig] | ConfigDraw, EnvOptions]:
     """Return configs and options from the arguments of an environment's constructor.
 
     Args:
-        config: a preset, a file, a config, or several configs.
+        config: a preset, a file, a config, several configs, or a function that draws configs.
         overrides: values that replace those of every config.
         options: options of the environment; None means the default options.
         keywords: fields of ``EnvOptions``, which take precedence over ``options``.
@@ -309,7 +368,8 @@ def configs_and_options(
     Raises:
         ConfigError: a config, override or option is not valid.
     """
-    configs = _configs(config, _checked_overrides(overrides))
+    changes = _checked_overrides(overrides)
+    configs = ConfigDraw(config, changes) if callable(config) else _configs(config, changes)
     return configs, _options(options, keywords, only_agent)
 
 

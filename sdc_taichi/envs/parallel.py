@@ -12,22 +12,29 @@ from sdc_taichi.envs.base import (
     METADATA,
     AgentSpaces,
     SingleEnv,
+    agent_part,
     as_scalars,
     first_of_batch,
     start_day_option,
 )
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.options import ConfigSource
+from sdc_taichi.errors import SdcError
 
 
 class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
-    """PettingZoo environment in which the learning agents of one data center act at the same time.
+    """PettingZoo environment in which the agents of a data center or fleet act at the same time.
+
+    Agents of a fleet that shares work have the names of their sites, such as ``NY/agent_geo``. The
+    group ``crac`` has an agent for each CRAC unit: ``crac_0``, ``crac_1`` and so on. An agent
+    stays in the environment while its unit is down; its info ``acts`` is then 0, and its action has
+    no effect.
 
     Episodes end by truncation, because their length is a choice and a data center has no final
     state; only a result beyond the physical limits terminates an episode. All agents have the same
-    infos: ``ended_by``, ``start_day``, the randomly drawn inputs, the facility's quantities of
-    ``StepResult`` by name, and the costs of the option ``costs``. Those of ``reset`` have the same
-    keys; ``ended_by``, quantities and costs are 0 there.
+    infos, except ``acts``: ``ended_by``, ``start_day``, the randomly drawn inputs, the facility's
+    quantities of ``StepResult`` by name, and the costs of the option ``costs``. Those of
+    ``reset`` have the same keys; ``ended_by``, quantities and costs are 0 there.
 
     Args:
         config: a preset, a file or a config.
@@ -46,10 +53,13 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 
     def __init__(self, config: ConfigSource = "corrected", **arguments: Any) -> None:
         self._open(config, 1, **arguments)
-        self.possible_agents: list[str] = list(self.core.agents)
+        self._groups = self.core.members
+        self.possible_agents: list[str] = [a for names in self._groups.values() for a in names]
         self.agents: list[str] = []
-        self.observation_spaces = self.core.observation_spaces
-        self.action_spaces = self.core.action_spaces
+        self.observation_spaces, self.action_spaces = (
+            {agent: spaces[group] for group, names in self._groups.items() for agent in names}
+            for spaces in (self.core.observation_spaces, self.core.action_spaces)
+        )
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -66,8 +76,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """
         observations = self.core.reset(seed, start_day_option(options, strict=False))
         self.agents = list(self.possible_agents)
-        info = as_scalars(self.core.infos())
-        return _first_of_each(observations), {agent: dict(info) for agent in self.agents}
+        return self._by_agent(observations), self._infos(self.core.infos())
 
     def step(
         self, actions: Mapping[str, Any]
@@ -88,18 +97,16 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
                 of an agent that does not learn.
             RuntimeStateError: the environment has not been reset, or the episode is over.
         """
-        if isinstance(actions, Mapping):
-            actions = {agent: [action] for agent, action in actions.items()}
-        transition = self.core.step(actions)
-        agents, info = self.agents, as_scalars(self.core.infos(transition))
+        transition = self.core.step(self._by_group(actions))
+        agents, infos = self.agents, self._infos(self.core.infos(transition))
         if transition.ended:
             self.agents = []
         return (
-            _first_of_each(transition.observations),
-            as_scalars(transition.rewards),
+            self._by_agent(transition.observations),
+            {agent: float(x) for agent, x in self._by_agent(transition.rewards).items()},
             dict.fromkeys(agents, bool(transition.terminated[0])),
             dict.fromkeys(agents, bool(transition.truncated[0])),
-            {agent: dict(info) for agent in agents},
+            infos,
         )
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
@@ -113,7 +120,46 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """
         observations = self.core.load_state_dict(values)
         self.agents = [] if self.core.episode_over else list(self.possible_agents)
-        return _first_of_each(observations)
+        return self._by_agent(observations)
+
+    def _by_agent(self, by_group: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of the only environment of the batch by agent."""
+        values: dict[str, Any] = {}
+        for group, names in self._groups.items():
+            first = first_of_batch(by_group[group])
+            if names == (group,):
+                values[group] = first
+            else:
+                values |= {agent: agent_part(first, i) for i, agent in enumerate(names)}
+        return values
+
+    def _by_group(self, actions: Any) -> Any:
+        """Return the actions of agents by group, with one environment; wrong ones as they are."""
+        if not isinstance(actions, Mapping):
+            return actions
+        left = dict(actions)
+        by_group: dict[str, Any] = {}
+        for group, names in self._groups.items():
+            if names == (group,):
+                if group in left:
+                    by_group[group] = [left.pop(group)]
+                continue
+            for agent in names:
+                if agent not in left:
+                    raise SdcError(f"actions: none for {agent}; valid: {self.possible_agents}")
+            by_group[group] = [[left.pop(agent) for agent in names]]
+        return by_group | {agent: [action] for agent, action in left.items()}
+
+    def _infos(self, infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return the infos of each agent, with ``acts`` for agents of CRAC units."""
+        masks = self.core.masks()
+        by_agent: dict[str, dict[str, Any]] = {}
+        for group, names in self._groups.items():
+            for i, agent in enumerate(names):
+                by_agent[agent] = as_scalars(infos, i)
+                if group in masks:
+                    by_agent[agent]["acts"] = int(masks[group][0, i])
+        return by_agent
 
 
 parallel_env = SdcParallelEnv
@@ -130,8 +176,3 @@ def aec_env(config: ConfigSource = "corrected", **arguments: Any) -> AECEnv[str,
         SdcError: a config or option is not valid.
     """
     return parallel_to_aec(parallel_env(config, **arguments))
-
-
-def _first_of_each(observations: Mapping[str, Observation]) -> dict[str, Observation]:
-    """Return the observations of the only environment of a batch by agent, (n,) each."""
-    return {agent: first_of_batch(values) for agent, values in observations.items()}

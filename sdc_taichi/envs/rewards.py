@@ -14,10 +14,19 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
+from sdc_taichi.envs.agents import (
+    AGENT_DEFINITIONS,
+    AGENTS,
+    ALL_AGENTS,
+    HALL_AGENTS,
+    present_agents,
+)
 from sdc_taichi.envs.released import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
+from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.view_terms import OF_DATA_CENTERS, OF_UNITS, ViewContext
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.user_functions import (
@@ -29,7 +38,8 @@ from sdc_taichi.user_functions import (
 
 RewardFunction = Callable[[StepResult, View], Any]
 """Reward function of a user. It takes the result of a step and the view after the step. It returns
-rewards, (B,), for every learning agent, or a dict of rewards, (B,) each, by learning agent."""
+rewards, (B,), for every learning agent, or a dict of rewards by learning group, (B,) each, or (U,)
+for a group with an agent for each CRAC unit."""
 
 _COUNTED_ONCE = ("default", "bill")
 """Reward sets whose joint reward counts each term once, even if several agents have this term. The
@@ -39,6 +49,10 @@ SCALED_SETS = (*_COUNTED_ONCE, "paper")
 REWARD_SETS = (*SCALED_SETS, "sustaindc")
 """Names of the built-in reward sets that the option ``rewards`` accepts."""
 
+_OF_UNITS = {agent for agent, definition in AGENT_DEFINITIONS.items() if definition.per_unit}
+"""Groups with an agent for each CRAC unit."""
+VIEW_TERMS = OF_DATA_CENTERS | OF_UNITS
+"""Terms that are functions of the view, by name."""
 MOST_SCALE = 1e9
 """Maximum absolute scale of a term, large enough for prices in any currency."""
 BILLED_SHARE = 0.5
@@ -93,6 +107,7 @@ class Rewards:
         days: float,
     ) -> None:
         self._collaboration, self._agents = collaboration, tuple(agents)
+        self._team = team_of(agents)
         self._released: ReleasedRewards | None = None
         self._function: RewardFunction | None = None
         self._scales: dict[str, dict[str, float]] = {}
@@ -101,29 +116,33 @@ class Rewards:
         if isinstance(rewards, str) and rewards == "sustaindc":
             self._released = ReleasedRewards()
         elif isinstance(rewards, Mapping):
-            self._scales = self.identity = _checked_scales(rewards)
+            self._scales = self.identity = _checked_scales(rewards, self._team)
         elif isinstance(rewards, str) and rewards in SCALED_SETS:
-            self._scales = self.identity = {
-                agent: definition.scales[rewards] for agent, definition in AGENT_DEFINITIONS.items()
-            }
+            self._scales = self.identity = {a: _scales_of(a, rewards) for a in self._team}
             if rewards in _COUNTED_ONCE and len(self._agents) > 1:
                 for agent in self._agents:
-                    self._joint_scales |= self._scales[agent]
+                    # The terms of units are parts of those of the plant.
+                    if agent not in _OF_UNITS or "plant" not in self._agents:
+                        self._joint_scales |= self._scales[agent]
         else:
             self._function = rewards if callable(rewards) else _function_named(rewards)
             self.identity = import_path(self._function)
         used = {name for scales in self._scales.values() for name in scales}
         self.used_terms = [name for name in TERMS if name in used]
+        self._view_terms = [name for name in VIEW_TERMS if name in used]
         self._stage: Any = None
         self._context = TermContext(days / BILL_DAYS)
+        self._of_view = ViewContext(self._context)
+        self._slots: UnitSlots | None = None
         # Highest billed power before and after the last step, in kW, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
 
-    def reset(self, view: View) -> None:
+    def reset(self, view: View, slots: UnitSlots) -> None:
         """Start an episode.
 
         Args:
             view: the view before the first step.
+            slots: places of CRAC units in the rewards of their agents.
 
         Raises:
             DataError: the carbon intensity is constant, so the released code's rewards cannot be
@@ -131,6 +150,10 @@ class Rewards:
         """
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
         self._context.reset(view)
+        if self._view_terms:
+            self._of_view.reset(view)
+        if slots is not self._slots:
+            self._slots, self._stage = slots, None
         if self._released is not None:
             self._released.reset(view)
 
@@ -170,19 +193,28 @@ class Rewards:
             self._context.begin_step(result.step, self._peak_before_kw)
             by_agent: dict[str, F64] = self._stage(context=self._context, result=result)
             self._peak_kw = by_agent.pop("peak_kw")
+            if self._view_terms:
+                return self._with_view_terms(by_agent, result, view)
             return by_agent, by_agent.pop("joint")
         self._peak_kw = _peak_kw(self._peak_kw, result)
         if self._function is not None:
             returned = self._function(result, view)
+            assert self._slots is not None
             if not isinstance(returned, Mapping):
                 for_all = checked_values("rewards function", returned, "all agents", view.size)
-                return dict.fromkeys(self._agents, for_all), for_all
-            return _with_sum(_checked_by_agent(returned, self._agents, view.size))
+                slots = for_all[:, None] * self._slots.exists
+                by_agent = {a: slots if a in _OF_UNITS else for_all for a in self._agents}
+                return by_agent, for_all
+            by_agent = _checked_by_agent(returned, self._agents, view.fleet)
+            joint = _sum([_mean_of_units(x, view.fleet) for x in by_agent.values()])
+            return {
+                a: self._slots.fill(x) if a in _OF_UNITS else x for a, x in by_agent.items()
+            }, joint
         assert self._released is not None
         return _with_sum(self._shared([*self._released.rewards(result, view).values()]))
 
     def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
-        """Return unscaled terms of the last step by name, (B,) each; by default all terms."""
+        """Return unscaled terms of the last step by name, (B,) each; by default ``TERMS``."""
         self._context.begin_step(result.step, self._peak_before_kw)
         return {name: TERMS[name](result, self._context) for name in names}
 
@@ -197,31 +229,103 @@ class Rewards:
     def _stage_function(self, context: Any, result: Any) -> dict[str, F64]:
         """Compute rewards by agent, the joint reward and the peak power of a step, (B,) each.
 
+        With terms of the view, the rewards are the individual ones, without those terms.
         ``CompiledStage`` traces this function.
         """
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
-        individual = [_weighed(terms, self._scales[agent]) for agent in AGENTS]
+        peak_kw = {"peak_kw": _peak_kw(context.peak_kw, result)}
+        if self._view_terms:
+            general = {
+                agent: {name: x for name, x in self._scales[agent].items() if name in terms}
+                for agent in self._team
+            }
+            individual_of = {a: _weighed(terms, x) for a, x in general.items() if x}
+            once = {name: x for name, x in self._joint_scales.items() if name in terms}
+            joint_of = {"joint": _weighed(terms, once)} if once else {}
+            return individual_of | joint_of | peak_kw
+        individual = [_weighed(terms, self._scales[agent]) for agent in self._team]
         by_agent, joint = _with_sum(self._shared(individual))
         if self._joint_scales:
             joint = _weighed(terms, self._joint_scales)
-        return by_agent | {"joint": joint, "peak_kw": _peak_kw(context.peak_kw, result)}
+        return by_agent | {"joint": joint} | peak_kw
 
     def _shared(self, individual: Sequence[F64]) -> dict[str, F64]:
-        """Return collaborative rewards by learning agent from the individual ones of ``AGENTS``."""
+        """Return collaborative rewards by learning agent from the individual ones of the team."""
         shared = collaborative_rewards(individual, self._collaboration)
-        by_agent = dict(zip(AGENTS, shared, strict=True))
+        by_agent = dict(zip(self._team, shared, strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
+
+    def _with_view_terms(
+        self, by_agent: dict[str, F64], result: StepResult, view: View
+    ) -> tuple[dict[str, F64], F64]:
+        """Return rewards and joint reward of a team with terms of the view.
+
+        Each agent of a CRAC unit counts as one agent of the team.
+
+        Args:
+            by_agent: individual rewards by group, and part of the joint reward that counts each
+                term once, both without terms of the view, (B,) each.
+            result: result of the step.
+            view: the view after the step.
+        """
+        fleet, slots = view.fleet, self._slots
+        assert slots is not None
+        joint = by_agent.pop("joint", np.zeros(view.size))
+        terms = {n: VIEW_TERMS[n](result, view, self._of_view) for n in self._view_terms}
+        individual: dict[str, F64] = {}
+        for agent in self._team:
+            scales = {n: x for n, x in self._scales[agent].items() if n in terms}
+            of_view = np.zeros(fleet.units if agent in _OF_UNITS else view.size)
+            individual[agent] = of_view + _weighed(terms, scales) + by_agent.get(agent, 0.0)
+        number = {a: fleet.unit_sums(np.ones(fleet.units)) for a in self._team if a in _OF_UNITS}
+        sums = {a: fleet.unit_sums(x) if a in _OF_UNITS else x for a, x in individual.items()}
+        total = _sum(list(sums.values()))
+        others = _sum([number.get(a, np.ones(view.size)) for a in self._team]) - 1.0
+        own = self._collaboration
+        weight = (1.0 - own) / np.maximum(others, 1.0)
+        rewards: dict[str, F64] = {}
+        for agent in self._agents:
+            value = individual[agent]
+            if agent in _OF_UNITS:
+                dc = fleet.unit_dc
+                rewards[agent] = slots.fill(own * value + weight[dc] * (total[dc] - value))
+            else:
+                rewards[agent] = own * value + weight * (total - value)
+        if not self._joint_scales:
+            return rewards, _sum([sums[a] / number.get(a, 1.0) for a in self._agents])
+        for name, scale in self._joint_scales.items():
+            if name in terms:
+                joint = joint + scale * _mean_of_units(terms[name], fleet)
+        return rewards, joint
+
+
+def team_of(agents: Sequence[str]) -> tuple[str, ...]:
+    """Return the groups whose individual rewards the collaborative rewards combine, in order.
+
+    They are the groups that learn, and the agents of the released code that exist beside them. If
+    only agents of the cooling of a hall learn, they are these.
+
+    Args:
+        agents: names of the groups that learn.
+    """
+    hall = set(HALL_AGENTS) if not set(HALL_AGENTS).isdisjoint(agents) else set[str]()
+    others = set(AGENTS) & set(present_agents(agents))
+    if hall and hall >= set(agents):
+        others = set()
+    return tuple(agent for agent in ALL_AGENTS if agent in {*agents, *hall, *others})
 
 
 def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:
-    """Compute collaborative rewards R_i = a r_i + (1 - a)/2 sum_{j != i} r_j (paper, section 4.5).
+    """Compute collaborative rewards R_i = a r_i + (1 - a)/(N - 1) sum_{j != i} r_j.
+
+    With N = 3 agents these are those of the paper (section 4.5).
 
     Args:
-        individual: r_LS, r_DC and r_BAT, (B,) each.
+        individual: individual reward r_i of each of the N agents, (B,) each.
         a: weight of an agent's individual reward, 0..1.
 
     Returns:
-        R_LS, R_DC and R_BAT, (B,) each.
+        R_i of each agent, (B,) each.
     """
     total, weight = _sum(individual), (1.0 - a) / (len(individual) - 1)
     return [a * reward + weight * (total - reward) for reward in individual]
@@ -232,19 +336,28 @@ def _peak_kw(before_kw: F64, result: StepResult) -> F64:
     return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
-def _checked_scales(by_agent: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+def _scales_of(agent: str, rewards: str) -> dict[str, float]:
+    """Return the scales of an agent in a reward set; the agent has none if it does not learn."""
+    scales = AGENT_DEFINITIONS[agent].scales
+    if rewards not in scales:
+        raise ConfigError(f"rewards {rewards!r}: {agent} has none; valid are {', '.join(scales)}")
+    return scales[rewards]
+
+
+def _checked_scales(
+    by_agent: Mapping[str, Mapping[str, float]], team: Sequence[str]
+) -> dict[str, dict[str, float]]:
     """Check a user's scales; agents without an entry receive those of reward set ``default``."""
     for agent, scales in by_agent.items():
-        if agent not in AGENTS:
-            raise ConfigError(
-                f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
-            )
+        if agent not in team:
+            raise ConfigError(f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, team)}")
         if not isinstance(scales, Mapping):
             raise ConfigError(f"rewards of {agent}: {scales!r}; valid is a dict of term to scale")
+        valid = list(OF_UNITS if agent in _OF_UNITS else [*TERMS, *OF_DATA_CENTERS])
         for name, scale in scales.items():
-            if name not in TERMS:
+            if name not in valid:
                 raise ConfigError(
-                    f"rewards of {agent}: unknown term {name!r}{suggestion_or_valid(name, TERMS)}"
+                    f"rewards of {agent}: unknown term {name!r}{suggestion_or_valid(name, valid)}"
                 )
             number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
             if not number or not abs(scale) <= MOST_SCALE:
@@ -253,8 +366,8 @@ def _checked_scales(by_agent: Mapping[str, Mapping[str, float]]) -> dict[str, di
                     f"-{MOST_SCALE:g}..{MOST_SCALE:g}"
                 )
     return {
-        agent: dict(by_agent.get(agent, definition.scales["default"]))
-        for agent, definition in AGENT_DEFINITIONS.items()
+        agent: dict(by_agent.get(agent, AGENT_DEFINITIONS[agent].scales["default"]))
+        for agent in team
     }
 
 
@@ -270,20 +383,36 @@ def _function_named(name: Any) -> RewardFunction:
 
 
 def _checked_by_agent(
-    returned: Mapping[Any, Any], agents: Sequence[str], size: int
+    returned: Mapping[Any, Any], agents: Sequence[str], fleet: Fleet
 ) -> dict[str, F64]:
-    """Check the dict that a user's function returned; return rewards by learning agent, (B,)."""
+    """Check the dict that a user's function returned; return rewards by learning group.
+
+    They are (B,), or (U,) for a group with an agent for each CRAC unit.
+    """
     for agent in returned:
-        if agent not in AGENTS:
+        if agent not in ALL_AGENTS:
             raise SdcError(
-                f"rewards function: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
+                f"rewards function: unknown agent {agent!r}{suggestion_or_valid(agent, ALL_AGENTS)}"
             )
     for agent in agents:
         if agent not in returned:
             raise SdcError(f"rewards function: returned none for {agent}")
     return {
-        agent: checked_values("rewards function", returned[agent], agent, size) for agent in agents
+        agent: checked_values(
+            "rewards function",
+            returned[agent],
+            agent,
+            fleet.units if agent in _OF_UNITS else fleet.size,
+        )
+        for agent in agents
     }
+
+
+def _mean_of_units(values: F64, fleet: Fleet) -> F64:
+    """Return the mean over the units of each data center, (B,); values of data centers stay."""
+    if len(values) == fleet.size:
+        return values
+    return np.asarray(fleet.unit_sums(values) / np.diff(fleet.unit_offsets))
 
 
 def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:

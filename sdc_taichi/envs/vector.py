@@ -360,7 +360,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
                 none = np.zeros(self.num_envs, dtype=np.bool_)
                 return (
                     first,
-                    {agent: np.zeros(self.num_envs, dtype=np.float32) for agent in self.agents},
+                    self._no_rewards(),
                     self._flags(none),
                     self._flags(none),
                     begun,
@@ -384,6 +384,14 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
             self._flags(transition.truncated),
             infos,
         )
+
+    def _no_rewards(self) -> dict[str, F32]:
+        """Return rewards of 0 by group, (E,) each, or (E, W) for a group with W agents."""
+        shapes = {
+            group: (self.num_envs,) if names == (group,) else (self.num_envs, len(names))
+            for group, names in self.core.members.items()
+        }
+        return {group: np.zeros(shape, dtype=np.float32) for group, shape in shapes.items()}
 
     def _flags(self, of_envs: Flags) -> dict[str, Flags]:
         """Return a copy of the flags of all environments, (B,), by agent."""

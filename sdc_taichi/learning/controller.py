@@ -112,7 +112,7 @@ class PolicyController:
                 agent: chosen.reshape(len(chosen), *(self._decoder.spaces[agent].shape or ()))
                 for agent, chosen in self.policy.actions(observer.observe(view)).items()
             }
-        commands: dict[str, Any] = {**self._decoder.decode(self._actions, view.state)}
+        commands: dict[str, Any] = {**self._decoder.decode(self._actions, view)}
         if self._by_others:
             by_others = self._others.act(view)
             commands |= {name: getattr(by_others, name) for name in self._by_others}

@@ -342,6 +342,13 @@ class Simulator:
             layer[rows] = np.repeat(of_rack, counts)[rows]
         return layers
 
+    def flows_tasks(self) -> F64:
+        """Return the work that sites of each fleet sent to each other in the last step, in tasks.
+
+        The axes are fleet, sender and receiver, (F, S, S). It is 0 if no transfer was commanded.
+        """
+        return self._started().transfer.flows_tasks()
+
     def intake_air(self) -> IntakeAir:
         """Return the air before the racks in the last step, the input of ``Inlets``.
 

@@ -107,6 +107,7 @@ class Transfer:
     def __init__(self, fleet: Fleet, sizing: Sizing) -> None:
         self._size, self._shared = fleet.size, fleet.shared_work
         self._flows = None if self._shared is None else Flows(self._shared)
+        self._sends = False
         if self._shared is not None:
             self._flexible_share = fleet.values("workload.flexible_share")
             self._max_utilisation = fleet.values("workload.max_utilisation")
@@ -140,6 +141,7 @@ class Transfer:
         if self._flows is None:
             return TransferResult(sent, got, refused, kwh, carbon_g, on_way, state.in_flight)
         in_flight = state.in_flight
+        self._sends = shares is not None
         if shares is not None:
             capacity = np.minimum(self._max_utilisation, max_utilisation) * TASKS_PER_STEP
             own = demand * TASKS_PER_STEP
@@ -153,6 +155,12 @@ class Transfer:
         return TransferResult(
             sent, in_flight[:, 0].copy(), refused, kwh, carbon_g, after.sum(axis=1), after
         )
+
+    def flows_tasks(self) -> F64:
+        """Return the work sent in the last step by sender and receiver, in tasks, (F, S, S)."""
+        if self._flows is None:
+            return np.zeros((self._size, 1, 1))
+        return self._flows.flow if self._sends else np.zeros_like(self._flows.flow)
 
     def close(self) -> None:
         """Release the kernel arrays."""
