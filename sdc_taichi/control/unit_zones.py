@@ -60,7 +60,7 @@ class UnitZones:
         self._all = np.ones(fleet.units)
         self._of_set: dict[tuple[int, bytes], list[I64]] = {}
         self._running = self._all
-        self._index = self._indexed(self._all)
+        self._index: _ZoneIndex | None = None
         self._seed: I64 | None = None
         self._error_k = np.zeros(fleet.units)
         self._last: StepResult | None = None
@@ -111,7 +111,9 @@ class UnitZones:
 
     def racks(self, running: F64) -> _ZoneIndex:
         """Return the racks of the zones for the running units: 1 for these, 0 else, (U,)."""
-        if running is not self._running and not np.array_equal(running, self._running):
+        if self._index is None or (
+            running is not self._running and not np.array_equal(running, self._running)
+        ):
             self._index, self._running = self._indexed(running), running.copy()
         return self._index
 

@@ -249,7 +249,7 @@ class View:
     zone_supply_ratio: F64
     """Supply air of each CRAC unit divided by what the racks need of it, 0..10, (U,), at the end of
     the last step: the pressure before its tiles as a multiple of that which just meets the need. 1
-    before the first step."""
+    before the first step, and unless fans are controlled."""
     flows_tasks: F64
     """Work that sites of each fleet sent to each other in the last step, in tasks, by fleet, sender
     and receiver, (F, S, S)."""
@@ -387,6 +387,7 @@ def view_maker(
     limits, sizing = limits_of(sim.fleet), sim.sizing
     walks: RandomWalks | None = None
     zones, even = UnitZones(sim.fleet), np.ones(sim.fleet.units)
+    has_fans = sim.fleet.models["crac_flow"] == "controlled"
     sites = sim.fleet.sites_per_fleet
     no_flows = np.zeros((sim.size // sites, sites, sites))
     if forecast_error != PERFECT:
@@ -404,8 +405,8 @@ def view_maker(
             step_h,
             sim.precision,
             zones,
-            even if last is None else sim.supply_ratio(),
-            no_flows if last is None else sim.flows_tasks().copy(),
+            sim.supply_ratio() if last is not None and has_fans else even,
+            sim.flows_tasks().copy() if last is not None and sites > 1 else no_flows,
             sim.zone_loads,
             forecast_error,
             walks,
