@@ -337,3 +337,33 @@ def test_missing_actions_of_a_unit_are_named() -> None:
         env.step(actions)
     with pytest.raises(SdcError, match="crac_9"):
         env.step(zeros(env) | {"crac_9": np.zeros(1)})
+
+
+class Drawn:
+    """Draws halls of two to four CRAC units."""
+
+    most_units = 4
+
+    def __call__(self, rng: np.random.Generator) -> Any:
+        return hall(int(rng.integers(2, 5)), f"hall.layout.containment={rng.uniform(0, 0.9)}")
+
+
+def test_every_episode_has_halls_of_its_own() -> None:
+    with closing(HALL_ENV(Drawn(), 3)) as env:
+        counts = []
+        for seed in (0, 1, 2):
+            first, _ = env.reset(seed=seed)
+            counts.append(env.core.masks()["crac"].sum(axis=1).tolist())
+            assert first["crac"].shape[:2] == (3, 4)
+        assert len({tuple(c) for c in counts}) > 1
+        # Environment i has the seed of the batch plus i.
+        assert counts[0][1:] == counts[1][:2]
+        still = {"crac": np.zeros((3, 4, 1)), "plant": np.zeros((3, 1))}
+        env.step(still)
+        state, (expected, *_) = env.state_dict(), env.step(still)
+    with closing(HALL_ENV(Drawn(), 3)) as env:
+        env.load_state_dict(state)
+        continued, *_ = env.step(still)
+    assert all(np.array_equal(continued[group], expected[group]) for group in expected)
+    with closing(HALL_ENV(HALL, 3)) as env, pytest.raises(SdcError, match="another fleet"):
+        env.load_state_dict(state)
