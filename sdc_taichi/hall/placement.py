@@ -23,6 +23,8 @@ MIN_HEADROOM_K = 0.1
 """Lower bound of the headroom of a bin under ``inlet-aware``, in K."""
 _LEAST_WEIGHT = 1e-100
 """Lower bound of positive weights divided by the largest weight of the data center."""
+CLEARLY_BELOW = 1.0 - 1e-9
+"""Share of a bin's capacity below which its load is below the capacity in spite of rounding."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -203,7 +205,12 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
 
     Bins of weight 0 must have capacity 0.
     """
-    room, weighted = count * capacity, count * weight
+    weighted = count * weight
+    level = _ratio(work, bins.sums(weighted))
+    load = level[bins.dc] * weight
+    if np.all((load < capacity * CLEARLY_BELOW) | (weight == 0.0)):
+        return load
+    room = count * capacity
     level_full = capacity / np.where(weight > 0.0, weight, 1.0)
     order = bins.order(level_full)
     # Work placed at the level that just fills a bin: earlier bins are full, later ones are not.
@@ -211,10 +218,14 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
     full = np.empty(len(room), dtype=np.bool_)
     full[order] = at_level <= work[bins.dc]
     rest = work - bins.sums(np.where(full, room, 0.0))
-    open_weight = bins.sums(np.where(full, 0.0, weighted))
-    some = open_weight > 0.0
-    level = np.where(some, rest, 0.0) / np.where(some, open_weight, 1.0)
+    level = _ratio(rest, bins.sums(np.where(full, 0.0, weighted)))
     return np.where(full, capacity, np.clip(level[bins.dc] * weight, 0.0, capacity))
+
+
+def _ratio(work: F64, weight: F64) -> F64:
+    """Return work divided by weight, (B,); 0 where the weight is 0."""
+    some = weight > 0.0
+    return np.asarray(np.where(some, work, 0.0) / np.where(some, weight, 1.0))
 
 
 def _relative_weights(values: F64, bins: Bins) -> F64:
