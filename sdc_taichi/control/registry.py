@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sdc_taichi.control.geo import Alone, Central, all_cleaner, all_to_cleanest, three_cleanest
+from sdc_taichi.control.hall_rules import HALL_RULES, hall_rule, is_hall_rule
 from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
     COMMANDS_OF_PART,
@@ -77,19 +78,20 @@ _POLICY = "policy:FOLDER"
 _registered: dict[str, Any] = {"policy": "sdc_taichi.learning.controller:policy_controller"}
 """Registered makers, or their import paths, by the part of a controller name before the colon.
 Import paths are resolved on first use."""
-_BUILT_IN = (*_CONTROLLERS, "constant", "policy")
+_BUILT_IN = (*_CONTROLLERS, *HALL_RULES, "constant", "policy")
 _SUGGESTION = " (did you mean {!r}?)"
 
 
 def controller_names() -> tuple[str, ...]:
     """Return the valid controller names.
 
+    ``follow`` and other rules for CRAC units take temperatures, see ``control.hall_rules``.
     ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``mpc-24h`` for any
     horizon and objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a training
     run or a policy. An import path ``module:name`` is also valid.
     """
     added = (name for name in _registered if name not in _BUILT_IN)
-    return (*_CONTROLLERS, _CONSTANT, _MPC, _POLICY, *added)
+    return (*_CONTROLLERS, *HALL_RULES, _CONSTANT, _MPC, _POLICY, *added)
 
 
 def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> None:
@@ -117,7 +119,8 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
 def is_path(name: str) -> bool:
     """Return True if a controller's name is an import path, False if it begins with a name."""
     kind, colon, _ = name.partition(":")
-    return bool(colon) and kind not in (*_registered, "constant") and not is_mpc(name)
+    is_named = kind in (*_registered, "constant") or is_mpc(name) or is_hall_rule(name)
+    return bool(colon) and not is_named
 
 
 def make_controller(spec: str | Controller, fleet: Fleet, *, allow_code: bool = True) -> Controller:
@@ -229,6 +232,8 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
         entry = _NamedController(lambda: model_predictive(name, agents), CONTROLLABLE)
     elif kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
+    elif is_hall_rule(name):
+        entry = _NamedController(lambda: hall_rule(name, fleet), ("cooling",))
     elif name in _CONTROLLERS:
         entry = _CONTROLLERS[name]
     else:
@@ -236,7 +241,9 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
     agent = _first_missing(parts, entry.parts)
     if agent is not None:
         able = [n for n, e in _CONTROLLERS.items() if agent in e.parts]
-        able += {"cooling": [_CONSTANT, _MPC, _POLICY], "geo": []}.get(agent, [_MPC, _POLICY])
+        able += {"cooling": [*HALL_RULES, _CONSTANT, _MPC, _POLICY], "geo": []}.get(
+            agent, [_MPC, _POLICY]
+        )
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )

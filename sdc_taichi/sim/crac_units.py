@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +123,34 @@ class CracUnits:
             water_setpoint_c=coldest_c,
             coil_limit_w=self._units.sum(self._capacity_w),
             coil_share=self._ones,
+        )
+
+    def at_speed(
+        self, unit_supply_c: F64, low: F64, high: F64, surroundings: Surroundings
+    ) -> Supply:
+        """Return the operation of the units at given supply temperatures and fan speeds.
+
+        Args:
+            unit_supply_c: Supply temperature of each unit, in C, (U,).
+            low: Minimum speed of each fan as a share of full speed, (U,).
+            high: Maximum speed of each fan as a share of full speed, (U,).
+            surroundings: Surroundings, of which the running units are read.
+        """
+        plant_setpoint_c, coil_limit_w, coil_share = self._served_by_plant(
+            unit_supply_c, surroundings
+        )
+        return replace(
+            self.initial_supply(),
+            unit_setpoint_c=unit_supply_c + self._setpoint_over_supply_k,
+            coldest_supply_c=unit_supply_c,
+            setpoint_c=self._units.mean(unit_supply_c + self._setpoint_over_supply_k),
+            fan_speed=low,
+            unit_low=low,
+            unit_high=high,
+            plant_setpoint_c=plant_setpoint_c,
+            water_setpoint_c=plant_setpoint_c,
+            coil_limit_w=coil_limit_w,
+            coil_share=coil_share,
         )
 
     def coldest_supply_c(self, unit_setpoint_c: F64) -> F64:

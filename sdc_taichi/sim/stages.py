@@ -256,7 +256,7 @@ def _copies(
     at: dict[tuple[int, float], DataCenterConfig] = {}
     for which, value_c in dict.fromkeys(zip(of.tolist(), setpoint_c.tolist(), strict=True)):
         if which not in plain:
-            plain[which] = _without_memory(configs[which])
+            plain[which] = without_memory(configs[which])
         hvac = plain[which].hvac
         setpoint = hvac.setpoint.model_copy(update={"initial_c": value_c})
         hvac = hvac.model_copy(update={"setpoint": setpoint})
@@ -264,7 +264,7 @@ def _copies(
     return [at[key] for key in zip(of.tolist(), setpoint_c.tolist(), strict=True)]
 
 
-def _without_memory(config: DataCenterConfig) -> DataCenterConfig:
+def without_memory(config: DataCenterConfig) -> DataCenterConfig:
     """Return a config without events, protection, transfers and thermal storage.
 
     Its steps are independent.
