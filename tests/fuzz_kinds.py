@@ -686,6 +686,8 @@ def saved_states(rng: Generator, folder: Path) -> Case:
 FORMS = ("parallel", "aec", "single", "joint", "make_vec", "vector")
 IDS = {"agent_ls": "Load", "agent_dc": "Cooling", "agent_bat": "Battery"}
 BATCH = 3
+LARGE_HALLS = ("hall_agents_16", "hall_agents_64")
+"""Presets that differ from ``hall_agents_6`` in size alone."""
 ACTIONS: dict[str, Callable[[Generator, gymnasium.Space[Any], tuple[int, ...], Any], Any]] = {
     "random": lambda rng, space, shape, valid: valid,
     "lowest": lambda rng, space, shape, valid: np.zeros_like(valid) - (valid.dtype.kind == "f"),
@@ -705,17 +707,19 @@ CLIPPED_ACTIONS = ("beyond", "huge")
 
 def options_of_environment(rng: Generator, form: str) -> dict[str, Any]:
     """Draw preset, precision, commands and kind of actions of an environment."""
-    preset = pick(rng, preset_names())
+    preset = pick(rng, [name for name in preset_names() if name not in LARGE_HALLS])
     overrides: dict[str, Any] = {"workload.trace": pick(rng, ("alibaba_1", "google_1"))}
     commands: dict[str, list[str]] = {}
-    closed = load_config(preset).hall.inlet_model == "recirculation"
+    config = load_config(preset)
+    closed = config.hall.inlet_model == "recirculation"
+    of_units = config.hvac.crac.flow_model == "controlled"
     if closed and rng.random() < 0.5:
         overrides["hvac.crac.flow_model"] = "controlled"
         commands["agent_dc"] = ["cooling", "fan"]
     if closed and rng.random() < 0.5:
         overrides["workload.placement"] = "weights"
         commands["agent_ls"] = ["load", "placement"]
-    if closed and preset != "hall_of_2026" and rng.random() < 0.3:
+    if closed and config.hvac.crac.spare_units == 0 and rng.random() < 0.3:
         overrides["hvac.crac.units"] = int(rng.integers(2, 5))
     options: dict[str, Any] = {
         "config": preset,
@@ -736,7 +740,16 @@ def options_of_environment(rng: Generator, form: str) -> dict[str, Any]:
                 rng, ("idle", "constant:20" if "agent_dc" not in agents else "idle")
             )
     if form in ("parallel", "vector", "aec"):
-        options["heat_map"] = bool(rng.random() < 0.1)
+        options["heat_map"] = bool(rng.random() < 0.1) and config.fleet is None
+        if of_units and rng.random() < 0.6:
+            options["agents"] = pick(rng, (["crac"], ["plant"], ["crac", "plant"]))
+            options |= {"rewards": "default", "others": "idle"}
+            commands = {}
+            if "crac" in options["agents"]:
+                options["neighbours"] = int(rng.integers(0, 4))
+        if config.fleet is not None and options["rewards"] != "bill":
+            options["agents"] = [*options["agents"], "agent_geo"]
+            options.pop("others", None)
     return options | ({"commands": commands} if commands else {})
 
 
@@ -800,10 +813,13 @@ def actions(rng: Generator, folder: Path) -> Case:
         for name in kinds:
             drawn = {}
             for of_agent, space in spaces.items():
-                shape = (*batch, *(space.shape or ()))
+                names = env.core.members.get(of_agent, ()) if form == "vector" else ()
+                members = (len(names),) if names not in ((), (of_agent,)) else ()
+                rows = (*batch, *members)
+                shape = (*rows, *(space.shape or ()))
                 space.seed(int(rng.integers(2**31)))
-                samples = [space.sample() for _ in range(BATCH)]
-                valid = np.stack(samples) if batch else np.asarray(samples[0])
+                samples = [space.sample() for _ in range(int(np.prod(rows)))]
+                valid = np.stack(samples).reshape(shape)
                 drawn[of_agent] = ACTIONS[name](rng, space, shape, valid)
             accepted = name in VALID_ACTIONS or (clips and name in CLIPPED_ACTIONS)
             try:
