@@ -10,6 +10,7 @@ from .control import make_controller as make_controller
 from .control import register_controller as register_controller
 from .envs.core import EndedBy as EndedBy
 from .envs.costs import register_cost as register_cost
+from .envs.hall import HallFamily as HallFamily
 from .envs.hall import hall_env as hall_env
 from .envs.options import EnvOptions as EnvOptions
 from .envs.parallel import aec_env as aec_env

@@ -3,17 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, overload
 
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig, load_config
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, HALL_AGENTS
 from sdc_taichi.envs.options import ConfigSource, fields_set
 from sdc_taichi.envs.parallel import SdcParallelEnv
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
+from sdc_taichi.sim.hall_family import hall_family
 
 HALL_OPTIONS: dict[str, Any] = {"agents": HALL_AGENTS, "actions": "continuous", "days": 1}
 """Options of environments of a hall that differ from those of data centers."""
 LARGEST_CHANGES = {"fan": ("fan_change", 0.1), "cooling": ("setpoint_change_k", 0.5)}
 """Option and its value that sets the largest change in a step of 5 minutes, by command."""
+
+
+@dataclass(frozen=True)
+class HallFamily:
+    """Draws halls that differ in size, units, density, containment and plenum.
+
+    It is a valid ``config`` of environments, which then have another hall in each episode.
+    """
+
+    base: str | DataCenterConfig = "hall_agents_16"
+    """Preset, file or config from which the halls have everything that does not differ."""
+    units: tuple[int, int] = (4, 24)
+    """Fewest and most CRAC units."""
+    ranges: Mapping[str, Any] = field(default_factory=dict)
+    """Other ranges by the name of the argument of ``sdc_taichi.sim.hall_family.hall_family``."""
+
+    @property
+    def most_units(self) -> int:
+        """Largest number of CRAC units of a hall."""
+        return self.units[1]
+
+    def __call__(self, rng: np.random.Generator) -> DataCenterConfig:
+        """Return a hall.
+
+        Args:
+            rng: source of the random numbers.
+
+        Raises:
+            ConfigError: a range is not valid.
+        """
+        base = load_config(self.base) if isinstance(self.base, str) else self.base
+        return hall_family(rng, 1, base, units=self.units, **self.ranges)[0]
 
 
 @overload
@@ -36,8 +73,9 @@ def hall_env(
     """Create an environment whose agents control the fans and the plant of a hall.
 
     Args:
-        config: a preset, a file or a config of a hall; with ``num_envs`` also several. The fans of
-            the CRAC units must be controlled (``hvac.crac.flow_model``).
+        config: a preset, a file or a config of a hall, or a ``HallFamily``; with ``num_envs`` also
+            several configs. The fans of the CRAC units must be controlled
+            (``hvac.crac.flow_model``).
         num_envs: number of halls in a batch of arrays; None creates a PettingZoo environment of one
             hall.
         arguments: arguments of ``parallel_env`` or ``vector_env``, which take precedence over
