@@ -1,4 +1,4 @@
-"""Reader of run folders: metrics.json and steps.parquet (see docs/run-folder.md).
+"""Reader of run folders: metrics.json, steps.parquet and flows.parquet (see docs/run-folder.md).
 
 Rows of steps.parquet are ordered by step, and within a step by data center, so that a column is an
 array (steps, data centers). The reader loads one row group at a time, so that memory is needed only
@@ -22,6 +22,7 @@ from sdc_taichi.config import DataCenterConfig, config_from_dict, load_json, loa
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.exogenous.year_clock import UTC_OFFSETS_H, YEARS
 from sdc_taichi.run.description import FORMAT
+from sdc_taichi.run.flows_file import FLOW_COLUMNS, FLOWS_FILE, PLACES_KEY
 from sdc_taichi.run.folder_writer import METRICS_FILE
 from sdc_taichi.run.steps_file import AIR_KEY, KEY_COLUMNS, METADATA_KEY, RACKS_KEY, STEPS_FILE
 from sdc_taichi.run.time_column import zone
@@ -117,6 +118,20 @@ class FleetSteps:
     first data center; all intervals but the last have equal length."""
     inlet_max_c: F64
     """Highest inlet temperature in each interval and data center, in C, (m, B)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetFlows:
+    """Work that the sites of fleets have sent to each other in a run, and where the sites are."""
+
+    table: pd.DataFrame
+    """One row per hour and pair of sites with flow, with the columns of flows.parquet; ``sender``
+    and ``receiver`` are indices of data centers."""
+    sites_per_fleet: int
+    """Number of sites of each fleet."""
+    place_deg: F64
+    """Latitude and longitude of each of B data centers, in degrees north and east, nan if they are
+    not known, (B, 2)."""
 
 
 def read_run(folder: str | Path) -> RunFolder:
@@ -305,6 +320,28 @@ def read_hottest_air(run: RunFolder, dc: int) -> object:
     return cast(object, stored[dc]) if stored else None
 
 
+def read_flows(run: RunFolder) -> FleetFlows | None:
+    """Read the flows of work between the sites of fleets; None if the run has no flows.parquet.
+
+    Raises:
+        SdcError: flows.parquet is damaged or belongs to another run.
+    """
+    path = run.path / FLOWS_FILE
+    if not path.exists():
+        return None
+    about, places = _stored_metadata(path), _stored_json(path, PLACES_KEY)
+    if about.get("fingerprint") != run.metrics["fingerprint"]:
+        raise SdcError(f"{path}: of another run than {METRICS_FILE}; simulate the run again")
+    index = {name: dc for dc, name in enumerate(run.names)}
+    with _open_parquet(path) as file, decoding(path, "flows of a run"):
+        table = read_parquet(file, FLOW_COLUMNS).to_pandas()
+        for end in ("sender", "receiver"):
+            table[end] = table[end].astype(str).map(index).astype(np.int64)
+        place_deg = np.array(places["place_deg"], dtype=np.float64)  # type: ignore[index]
+        sites = int(places["sites_per_fleet"])  # type: ignore[index]
+    return FleetFlows(table, sites, place_deg)
+
+
 def _read_metrics(path: Path) -> dict[str, Any]:
     """Read metrics.json and check its fields."""
     with _part_of_run():
@@ -435,7 +472,7 @@ def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def _stored_metadata(path: Path) -> dict[str, Any]:
-    """Read the description of the run from the metadata of steps.parquet."""
+    """Read the description of the run from the metadata of a Parquet file of its folder."""
     stored = _stored_json(path, METADATA_KEY)
     if not isinstance(stored, dict):
         raise SdcError(f"{path}: no sdc_taichi metadata; valid is a file written by simulate")
@@ -443,7 +480,7 @@ def _stored_metadata(path: Path) -> dict[str, Any]:
 
 
 def _stored_json(path: Path, key: bytes) -> object:
-    """Read the JSON value of a metadata key of steps.parquet; None if missing or not valid."""
+    """Read the JSON value of a metadata key of a Parquet file; None if missing or not valid."""
     with _open_parquet(path) as file:
         metadata = file.metadata.metadata or {}
     try:

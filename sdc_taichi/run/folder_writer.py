@@ -1,10 +1,10 @@
 """Simulation of a run and writer of its run folder.
 
 A run folder contains ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
-``configs.yaml`` (several, one YAML document each), and on request ``racks.parquet``. Every file is
-written under a temporary name and renamed when it is complete; while a run writes, a second run
-into the folder is refused. Equal runs produce identical bytes on processors with the same features.
-See docs/run-folder.md for the columns.
+``configs.yaml`` (several, one YAML document each), ``flows.parquet`` if fleets share work, and on
+request ``racks.parquet``. Every file is written under a temporary name and renamed when it is
+complete; while a run writes, a second run into the folder is refused. Equal runs produce identical
+bytes on processors with the same features. See docs/run-folder.md for the columns.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from sdc_taichi.errors import ConfigError, PhysicalLimitError
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import achievement, begin_score, put_beside
 from sdc_taichi.run.description import RunRequest, describe_run
+from sdc_taichi.run.flows_file import FLOWS_FILE, FlowsWriter
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Totals, empty_totals, metrics_of_fleet, metrics_per_dc
 from sdc_taichi.run.rack_history import (
@@ -106,6 +107,9 @@ def simulate_to_folder(
     with contextlib.ExitStack() as files:
         files.enter_context(metrics_file)
         writer = files.enter_context(StepsWriter(out / STEPS_FILE, sim, metadata))
+        flows = None
+        if sim.fleet.shared_work is not None:
+            flows = files.enter_context(FlowsWriter(out / FLOWS_FILE, sim, description))
         racks = None
         if history is not None:
             path = out / RACK_HISTORY_FILE
@@ -117,6 +121,8 @@ def simulate_to_folder(
 
         def write_step(result: StepResult) -> None:
             writer.add(result)
+            if flows is not None:
+                flows.add(result)
             if racks is not None:
                 racks.add(result)
             if score is not None:
@@ -146,11 +152,14 @@ def simulate_to_folder(
         if totals.steps == 0:
             return None
         writer.commit()
+        if flows is not None:
+            flows.commit()
         if racks is not None:
             racks.commit()
         write_text(out / config_name, configs)
         if has_former_run:
-            former = () if racks is not None else (RACK_HISTORY_FILE,)
+            tables = {RACK_HISTORY_FILE: racks, FLOWS_FILE: flows}
+            former = [name for name, table in tables.items() if table is None]
             for name in (other_name, REPORT_FILE, OPTIMUM_FILE, *EXPORT_FILES, *former):
                 with naming_errors(out / name):
                     (out / name).unlink(missing_ok=True)
@@ -249,7 +258,8 @@ def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[st
 
 def _is_left_by_broken_run(path: Path) -> bool:
     """Return True for a file that a run can leave behind if it ends before writing metrics.json."""
-    names = (STEPS_FILE, RACK_HISTORY_FILE, REPORT_FILE, OPTIMUM_FILE, *EXPORT_FILES)
+    tables = (STEPS_FILE, FLOWS_FILE, RACK_HISTORY_FILE)
+    names = (*tables, REPORT_FILE, OPTIMUM_FILE, *EXPORT_FILES)
     return path.name in names or path.suffix in (".part", ".rrd")
 
 

@@ -133,6 +133,9 @@ class Drivers:
     weather, of the carbon intensity or of the workload, or else ``TYPICAL_YEAR``."""
     utc_offset_h: F64
     """Local standard time minus UTC, in h, (B,)."""
+    place_deg: F64
+    """Latitude and longitude of the weather station, in degrees north and east, nan if they are not
+    known, (B, 2)."""
     design_outdoor_c: F64
     """Design dry bulb in C, (B,): that of the weather file, or else the dry bulb exceeded in 0.4 %
     of the year."""
@@ -172,6 +175,7 @@ class Drivers:
             start=self.start[chosen],
             year=self.year[chosen],
             utc_offset_h=self.utc_offset_h[chosen],
+            place_deg=self.place_deg[chosen],
             design_outdoor_c=self.design_outdoor_c[chosen],
             design_wet_bulb_c=self.design_wet_bulb_c[chosen],
             sources=tuple(self.sources[i] for i in chosen),
@@ -300,6 +304,7 @@ class InputReader:
                 ]
             ),
             utc_offset_h=utc_offset_h,
+            place_deg=np.array([(site.latitude_deg, site.longitude_deg) for site, _ in inputs]),
             design_outdoor_c=self._design_c[0],
             design_wet_bulb_c=self._design_c[1],
             sources=tuple(
@@ -492,6 +497,7 @@ def drivers_from_arrays(
         start=np.zeros(size, dtype=np.int64),
         year=np.full(size, TYPICAL_YEAR, dtype=np.int64),
         utc_offset_h=np.zeros(size),
+        place_deg=np.full((size, 2), np.nan),
         design_outdoor_c=np.quantile(rows["outdoor_c"], DESIGN_QUANTILE, axis=1),
         design_wet_bulb_c=np.quantile(rows["wet_bulb_c"], DESIGN_QUANTILE, axis=1),
         sources=({"weather": source, "carbon": source, "workload": source},) * size,
