@@ -102,6 +102,14 @@ def test_plans_without_coordination_change_no_other_result_and_are_kept(
     assert solved(tmp_path, "cost", 1).uncoordinated == {}
 
 
+def test_agents_stay_idle_where_no_plan_does_all_work() -> None:
+    crowded = config("workload.max_utilisation=0.3", "workload.queue_limit_h=0.5")
+    found = solve(crowded, steps=24, agents=("load", "battery"), uncoordinated=True, cache=False)
+    assert found.bound_kinds[0].startswith("none: ")
+    assert found.uncoordinated["together"][0] <= found.idle[0]
+    assert any("one after another ends with" in text for text in found.failures[0])
+
+
 def test_the_load_plans_around_a_battery_that_it_knows() -> None:
     """Where power is billed, work leaves the hours in which a known battery charges."""
     configs = [config("tariff.demand_charge_per_kw=1000")]

@@ -251,10 +251,10 @@ class _Case:
             for name, run in self.runs.items()
             if name not in self.uncoordinated
         }
-        idle = certificates[IDLE]
+        uncoordinated = {way: self.runs[way].certificate for way in self.uncoordinated}
+        idle, capacity_kwh = certificates[IDLE], self.problem.storage.capacity_kwh
         failures = {
-            name: of_path.failures(idle, self.problem.storage.capacity_kwh)
-            for name, of_path in certificates.items()
+            name: of_path.failures(idle, capacity_kwh) for name, of_path in certificates.items()
         }
         valid = [name for name, texts in failures.items() if not texts] or [IDLE]
 
@@ -288,15 +288,33 @@ class _Case:
             cooling=done.cooling_command[:, 0],
             battery=done.battery_command[:, 0],
             uncoordinated={
-                way: _valued_figure(self.problem, self.runs[way].certificate)
-                for way in self.uncoordinated
+                way: self._valued_figure(certificate) for way, certificate in uncoordinated.items()
             },
             uncoordinated_failures=tuple(
                 f"the path of {title_of(way)} {text}"
-                for way in self.uncoordinated
-                for text in self.runs[way].certificate.broken(idle)
+                for way, certificate in uncoordinated.items()
+                for text in (
+                    certificate.failures(idle, capacity_kwh)
+                    if self.no_bound
+                    else certificate.broken(idle)
+                )
             ),
         )
+
+    def _valued_figure(self, of_path: Certificate) -> float:
+        """Return the figure of a path, plus the value of what it lacks at its end.
+
+        The value is the difference of the bounds for this end and for an end equal to the start; it
+        is 0 without a bound.
+        """
+        if self.no_bound or not of_path.worse_ends(self.problem.storage.capacity_kwh):
+            return of_path.figure
+        start = of_path.start_kwh, of_path.start_tasks
+        best, cyclic = (
+            bound(self.problem, Ends(*start, *end)).figure
+            for end in ((of_path.end_kwh, of_path.end_tasks), start)
+        )
+        return of_path.figure + cyclic - best
 
     def best_response(
         self, agent: Agent, others: Mapping[Agent, F64], check: Callable[[], None]
@@ -328,20 +346,6 @@ def _of_case(plans: Mapping[Agent, _Plans], i: int) -> dict[Agent, F64]:
     """Return the plans of data center ``i``, without those of agents that have none."""
     of_case = {agent: of_all[i] for agent, of_all in plans.items()}
     return {agent: plan for agent, plan in of_case.items() if plan is not None}
-
-
-def _valued_figure(problem: Problem, of_path: Certificate) -> float:
-    """Return the figure of a path, plus the value of what it lacks at its end.
-
-    The value is the difference of the bounds for this end and for an end equal to the start.
-    """
-    if not of_path.worse_ends(problem.storage.capacity_kwh):
-        return of_path.figure
-    start = of_path.start_kwh, of_path.start_tasks
-    ends = Ends(*start, of_path.end_kwh, of_path.end_tasks)
-    return (
-        of_path.figure + bound(problem, Ends(*start, *start)).figure - bound(problem, ends).figure
-    )
 
 
 def _unreachable_limit(best: Certificate) -> tuple[str, ...]:
