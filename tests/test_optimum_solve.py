@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config, pr
 from sdc_taichi.control import make_controller
 from sdc_taichi.optimum import Objective, Optimum, StoppedError, solve
 from sdc_taichi.optimum.cache import OptimumCacheWarning
-from sdc_taichi.optimum.problem import AGENTS, Ends
+from sdc_taichi.optimum.problem import AGENTS, Agent, Ends, Problem
+from sdc_taichi.optimum.rollout import Targets
 from sdc_taichi.optimum.tables import FacilityTable, facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
@@ -111,6 +113,29 @@ def test_a_warm_up_leaves_the_state_of_the_first_scored_step_free() -> None:
         score = begin_score(found, sim, 0)
         simulate(sim, AchievedPath(found), found.steps, on_step=score.add)
     assert score.figure[0] == found.achieved[0]
+
+
+def test_batteries_that_end_with_too_little_are_planned_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = config_of("CA", "battery.initial_soc=0.5")
+    right = solved(config, steps=24)
+    module = sys.modules["sdc_taichi.optimum.solve"]
+    path_of = module.path_of
+
+    def short(problem: Problem, agents: tuple[Agent, ...], *check: Any) -> Targets:
+        path: Targets = path_of(problem, agents, *check)
+        path.stored_kwh[-1] -= 0.001 * problem.storage.capacity_kwh
+        return path
+
+    monkeypatch.setattr(module, "path_of", short)
+    found = solved(config, steps=24)
+    assert found.failures == ((),)
+    assert found.achieved[0] == pytest.approx(right.achieved[0], rel=1e-3)
+    assert found.alone["battery"][0] == pytest.approx(right.alone["battery"][0], rel=1e-3)
+    monkeypatch.setattr(module._Work, "_plan_short_ends_again", lambda *_: None)
+    (texts,) = solved(config, steps=24).failures
+    assert any("path of battery ends with" in text for text in texts)
 
 
 def test_inlets_stay_within_a_limit() -> None:

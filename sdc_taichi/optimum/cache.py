@@ -24,7 +24,7 @@ from sdc_taichi.sim import snapshot
 from sdc_taichi.types import F64
 
 _X = TypeVar("_X")
-METHOD = 2
+METHOD = 3
 """Version of the solution method. Cached files of other versions are not used."""
 _MOST_FIGURE = 1e15
 """Largest figure of a cached optimum."""

@@ -322,7 +322,8 @@ class DispatchProgramme:
         relate = p.equal if limits.square_per_kwh == 0.0 else p.at_most
         relate("energy", stored - before - gain, limits.rounding_kwh)
         if span.as_after is not None:
-            p.at_most("end_energy", stored[span.as_after - span.first], stored[-1])
+            needed_kwh = stored[span.as_after - span.first] + problem.end_margin_kwh
+            p.at_most("end_energy", needed_kwh, stored[-1])
         for name, energy, lines in (
             ("charge", charge, limits.charge),
             ("discharge", discharge, limits.discharge),

@@ -206,7 +206,8 @@ def _span(problem: Problem, ends: Ends | None) -> Span:
         return Span(
             0, problem.steps, start_kwh=stored, start_tasks=0.0, as_after=problem.scored_from - 1
         )
-    return Span(0, problem.steps, start_kwh=stored, start_tasks=0.0, end_kwh=stored, end_tasks=0.0)
+    end_kwh = stored + problem.end_margin_kwh
+    return Span(0, problem.steps, start_kwh=stored, start_tasks=0.0, end_kwh=end_kwh, end_tasks=0.0)
 
 
 def _modes(problem: Problem, span: Span, dispatch: Dispatch) -> I64:

@@ -179,6 +179,8 @@ class Problem:
     battery_kwh: F64 | None = None
     """Energy that a battery outside ``agents`` draws from the bus in each step, standby included,
     in kWh, (T,); negative where the battery delivers. None means an idle battery."""
+    end_margin_kwh: float = 0.0
+    """Energy that the plan of a battery stores at the end beyond what the end needs, in kWh."""
 
     @property
     def steps(self) -> int:

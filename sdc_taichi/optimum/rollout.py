@@ -423,14 +423,23 @@ class Certificate:
         Args:
             capacity_kwh: Capacity of the battery, in kWh.
         """
-        missing_kwh = self.start_kwh - self.end_kwh
+        missing_kwh = self.missing_kwh(capacity_kwh)
         more_tasks = self.end_tasks - self.start_tasks
         texts = []
-        if missing_kwh > _LEAST_STORED_SHARE * capacity_kwh:
+        if missing_kwh > 0.0:
             texts.append(f"ends with {missing_kwh:.4g} kWh less in the battery")
         if more_tasks > _LEAST_TASKS:
             texts.append(f"ends with {more_tasks:.4g} tasks more in the queue")
         return tuple(texts)
+
+    def missing_kwh(self, capacity_kwh: float) -> float:
+        """Return the stored energy that the end lacks, in kWh; 0 within rounding errors.
+
+        Args:
+            capacity_kwh: Capacity of the battery, in kWh.
+        """
+        missing_kwh = self.start_kwh - self.end_kwh
+        return missing_kwh if missing_kwh > _LEAST_STORED_SHARE * capacity_kwh else 0.0
 
     def broken(self, idle: Certificate) -> tuple[str, ...]:
         """Return the constraints on work and temperatures that the plan breaks, in words.

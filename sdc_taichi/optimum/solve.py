@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -76,6 +76,8 @@ _SOLVER_ERROR = 1e-6
 """Margin of the bound for the errors of solvers and for tolerances of the end state, relative."""
 _AGAIN = "all agents with the battery planned again"
 """Name of the path whose battery is planned for the simulated energy of the facility."""
+_MARGIN_FACTOR = 2.0
+"""Margin of a battery plan at its end, relative to the energy that the plan before lacked."""
 _POLL_S = 0.2
 """Time between two calls of ``stop``, in s."""
 
@@ -316,6 +318,12 @@ class _Case:
         )
         return of_path.figure + cyclic - best
 
+    def missing_kwh(self, name: str) -> float:
+        """Return the stored energy that a simulated plan lacks at its end, in kWh; 0 without it."""
+        if name not in self.runs:
+            return 0.0
+        return self.runs[name].certificate.missing_kwh(self.problem.storage.capacity_kwh)
+
     def best_response(
         self, agent: Agent, others: Mapping[Agent, F64], check: Callable[[], None]
     ) -> F64 | None:
@@ -395,6 +403,19 @@ def _bound_or_path(
         return error
 
 
+def _with_margin(case: _Case, name: str, _check: Callable[[], None]) -> Targets:
+    """Plan the battery of a simulated path again, to end with more energy than the end needs.
+
+    If no plan can, the path is returned as it is.
+    """
+    run, margin_kwh = case.runs[name], _MARGIN_FACTOR * case.missing_kwh(name)
+    problem = replace(case.problem, end_margin_kwh=margin_kwh)
+    try:
+        return with_battery_for(problem, run.path, run.done.facility_kwh[:, 0])
+    except ConfigError:
+        return run.path
+
+
 class _Work:
     """Solves a task stage by stage, with progress reports and a way to stop.
 
@@ -452,6 +473,7 @@ class _Work:
         ]
         self._run(task, cases, self._bounds_and_paths(cases))
         self._plan_batteries_again(task, cases)
+        self._plan_short_ends_again(task, cases)
         if task.uncoordinated:
             self._run_uncoordinated(task, cases)
         return cases
@@ -494,6 +516,19 @@ class _Work:
         again = [cases[i] for i in chosen]
         paths = self._in_threads([partial(battery_again, case) for case in again])
         self._run(task.part(chosen), again, [{_AGAIN: path} for path in paths])
+
+    def _plan_short_ends_again(self, task: Task, cases: Sequence[_Case]) -> None:
+        """Plan batteries again, with a margin, if a simulated battery ends with too little energy.
+
+        The square loss of a battery is a little larger than that of its linear programme, so a
+        battery that charges in the last step may miss the end by a small amount.
+        """
+        for name in ("battery", JOINT, _AGAIN):
+            chosen = [i for i, case in enumerate(cases) if case.missing_kwh(name) > 0.0]
+            if chosen:
+                short = [cases[i] for i in chosen]
+                paths = self._in_threads([partial(_with_margin, case, name) for case in short])
+                self._run(task.part(chosen), short, [{name: path} for path in paths])
 
     def _run_uncoordinated(self, task: Task, cases: Sequence[_Case]) -> None:
         """Simulate the plans that the agents of B data centers make without coordination."""
