@@ -100,7 +100,8 @@ API = (
             (
                 "sdc_taichi",
                 [
-                    *("vector_env", "parallel_env", "aec_env", "EnvOptions", "EndedBy"),
+                    *("vector_env", "parallel_env", "aec_env", "hall_env", "HallFamily"),
+                    *("EnvOptions", "EndedBy"),
                     *("register_reward", "register_cost", "RecordEpisodes", "EpisodeRecorder"),
                 ],
             )
