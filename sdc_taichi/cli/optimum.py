@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sdc_taichi.cli.fleet_optimum import print_fleet_optimum, require_carbon_alone
 from sdc_taichi.cli.options import (
     Compared,
     ConfigOptions,
@@ -102,6 +103,7 @@ def optimum_command(
 
     Prints a lower bound for all controllers, a figure that the simulator has reached, and where
     named controllers are between idle commands and that figure. All inputs are known in advance.
+    For a fleet that shares work, load, cooling and transfers are moved for the least carbon.
     """
     from sdc_taichi.control import make_controller
     from sdc_taichi.optimum.objective import Objective
@@ -121,6 +123,22 @@ def optimum_command(
         raise ConfigError(f"--uncoordinated --agents {agents}: valid is with two or more agents")
     error = run.error()
     named = {name: make_controller(name, fleet) for name in controller or ()}
+    if fleet.sites_per_fleet > 1:
+        require_carbon_alone(str(aim), warm_up=warm_up, max_inlet=max_inlet, out=out)
+        with Simulator(fleet, precision=run.precision) as sim, interruptible() as interrupted:
+            print_notes(sim.drivers.notes)
+            with exit_if_stopped():
+                print_fleet_optimum(
+                    sim,
+                    steps,
+                    named,
+                    seed=run.seed,
+                    error=error,
+                    quiet=quiet,
+                    as_json=as_json,
+                    stop=interrupted,
+                )
+        return
     for name, named_controller in named.items():
         _require_movable(name, named_controller, movable)
     if out is not None:

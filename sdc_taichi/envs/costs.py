@@ -55,10 +55,7 @@ def fleet_power(result: StepResult, view: View) -> F64:
     """Energy that a fleet draws above its power budget, in kWh, given to sites by their shares."""
     shared = view.fleet.shared_work
     assert shared is not None
-    budget_kw, ratio = shared.power_limit_kw, shared.power_limit_ratio
-    by_ratio_kw = ratio * shared.fleet_sums(view.sizing.facility_w) / 1e3
-    limit_kw = np.where(np.isnan(budget_kw), by_ratio_kw, budget_kw)
-    return shared.excess(result.grid_kwh, limit_kw * result.step_h)
+    return shared.excess(result.grid_kwh, shared.power_kw(view.sizing) * result.step_h)
 
 
 def fleet_carbon(result: StepResult, view: View) -> F64:

@@ -104,7 +104,7 @@ def best_response(
         return plan(replace(known, agents=(agent,)), check=check).executed_tasks
     utilisation = _utilisation(known)
     if agent == "cooling":
-        return _setpoints_c(known, utilisation)
+        return cheapest_setpoints_c(known, utilisation)
     return _stored_kwh(known, facility_kwh(known.table, utilisation, known.idle_setpoint_c))
 
 
@@ -182,7 +182,7 @@ def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:
     return queue
 
 
-def _setpoints_c(problem: Problem, utilisation: F64) -> F64:
+def cheapest_setpoints_c(problem: Problem, utilisation: F64) -> F64:
     """Return the setpoints of lowest cost for the utilisation of each step, in C, (T,)."""
     table = problem.table
     energy = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)

@@ -114,8 +114,8 @@ class Queue:
             self._load(queue)
         assert self._kernel is not None
         self._dequeued[:], self._deferred[:] = dequeued, deferred
-        if landed is not None:
-            self._landed[:] = landed
+        if self._delay:
+            self._landed[:] = 0.0 if landed is None else landed
         # Invalid until the kernel has finished, in case the step is interrupted.
         self._last = None
         after = vector_rows(self._length, self._size)
@@ -264,13 +264,12 @@ class Workload:
             "due": due,
             "max_utilisation": np.minimum(self._max_utilisation, max_utilisation),
         }
-        if self._flexible_share is None:
+        if self._flexible_share is None or transfer is None:
             decided = self._decide(**point)
             after = self._queue.end_step(
                 queue, decided["dequeued_tasks"], decided["deferred_tasks"]
             )
         else:
-            assert transfer is not None
             decided = self._decide(**point, sent=transfer.sent_tasks, landed=transfer.landed_tasks)
             # The youngest flexible work waits first, that of other sites after it.
             own = self._flexible_share * decided["arrived_tasks"] - transfer.sent_tasks
