@@ -25,6 +25,7 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
     make_configs,
+    with_values,
 )
 from sdc_taichi.control import (
     Controller,
@@ -249,7 +250,8 @@ def test_every_name_runs(name: str, sim: Simulator, tmp_path: Path) -> None:
     if name.startswith("geo-"):
         with pytest.raises(ConfigError, match="data centers share no work; valid with a config"):
             make_controller(name, sim.fleet)
-        with Simulator(load_config("fleet_of_eight")) as fleet:
+        sites = {"fleet": {"sites": ["AZ", "WA"]}, "workload.flexible_share": 0.5}
+        with Simulator(with_values(TINY, sites)) as fleet:
             sent = simulate(fleet, make_controller(name, fleet.fleet), 8, 1).sums["sent_tasks"]
             assert sent.sum() > 0
         return

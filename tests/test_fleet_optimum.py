@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from typer.testing import CliRunner
 from sdc_taichi import Simulator, load_config, with_values
 from sdc_taichi.cli.app import app
 from sdc_taichi.optimum.fleet import Hub, fleet_plan, solve_fleet
+from sdc_taichi.optimum.problem import FlexibleWork
 from sdc_taichi.optimum.programme import InfeasibleError
 from sdc_taichi.optimum.stage_cost import LoadCurves
 from sdc_taichi.types import F64
@@ -31,27 +31,20 @@ def figure(
     curves = [
         LoadCurves(nothing, nothing, nothing, np.arange(steps), width, row, kwh) for row in ci
     ]
-    problems: Any = [
-        SimpleNamespace(
-            steps=steps,
-            work=SimpleNamespace(
-                arrived_tasks=row, queue_limit_tasks=np.inf, deadline_steps=deadline
-            ),
-        )
-        for row in arrivals
-    ]
-    values = {
+    works = [FlexibleWork(row, row, row, width, np.inf, deadline, "fluid") for row in arrivals]
+    values: dict[str, Any] = {
         "flexible_tasks": arrivals,
         "most_sent": np.full(sites, np.inf),
         "most_got": np.full(sites, np.inf),
         "groups": (tuple(range(sites)),),
-        "delay_steps": 0,
+        "delay_h": 0,
         "steps_per_hour": 1,
         "half_weight": np.full(ci.shape, transfer / 2),
         "power_limit_kwh": np.inf,
+        "waiting_tasks": np.zeros(ci.shape),
     }
     move = more.pop("move", True)
-    return fleet_plan(problems, curves, Hub(**values | more), move=move).figure
+    return fleet_plan(works, curves, Hub(**values | more), move=move).figure
 
 
 def every_placement(
@@ -77,7 +70,7 @@ def every_placement(
 
 def test_least_cost_of_unit_tasks() -> None:
     ci = np.array([[496.0, 97, 148], [180, 149, 490]])
-    arrivals = np.array([[2, 1, 0], [0, 0, 1]])
+    arrivals = np.array([[2.0, 1, 0], [0, 0, 1]])
     case = {"capacity": 3, "transfer": 40, "deadline": 1}
     assert every_placement(ci, arrivals, **case) == 479.0
     assert figure(ci, arrivals, **case) == pytest.approx(479.0, rel=1e-9)
@@ -85,7 +78,7 @@ def test_least_cost_of_unit_tasks() -> None:
     for seed in range(40):
         rng = np.random.default_rng(seed)
         ci = rng.integers(50, 600, (2, 3)).astype(float)
-        arrivals = rng.integers(0, 3, (2, 3))
+        arrivals = rng.integers(0, 3, (2, 3)).astype(float)
         if arrivals.sum() > 5:
             continue
         case = {"capacity": 2, "transfer": 90, "deadline": int(rng.integers(1, 3))}
@@ -105,7 +98,7 @@ def test_limits_of_the_hub() -> None:
     linked = figure(ci, arrivals, most_sent=np.full(3, 0.5), **case)
     got = figure(ci, arrivals, most_got=np.full(3, 0.5), **case)
     grouped = figure(ci, arrivals, groups=((0, 1), (2,)), **case)
-    late = figure(ci, arrivals, delay_steps=1, **case)
+    late = figure(ci, arrivals, delay_h=1, **case)
     dear = figure(ci, arrivals, **case | {"transfer": 100})
     for limited in (linked, got, grouped, late, dear):
         assert both < limited < alone

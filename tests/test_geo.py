@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,11 +14,13 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
     make_controller,
+    simulate,
     with_values,
 )
 from sdc_taichi.control import commands_of
 from sdc_taichi.control.geo import all_cleaner, all_to_cleanest, central_flows, three_cleanest
 from sdc_taichi.control.view import view_maker
+from sdc_taichi.optimum.fleet import emissions_g
 
 CI = np.array([[500.0, 100.0, 300.0, 200.0], [10.0, 10.0, 10.0, 10.0]])
 NO_LINK = np.full((2, 4, 4), np.inf)
@@ -67,3 +72,45 @@ def test_the_central_rule_in_the_simulator() -> None:
         assert not result.refused_tasks.any()
         result = sim.step(controller.act(view(result)))
         assert result.utilisation.tolist() == pytest.approx([0.7, 0.3, 0.9])
+
+
+def test_plans_of_a_fleet_save_as_much_as_rules_and_can_be_followed() -> None:
+    config = with_values(
+        load_config("tiny", ["workload.flexible_share=0.5", "site.start=07-09"]),
+        {"fleet": {"sites": ["AZ", "IL", "WA"], "link_share_per_hour": 0.3}},
+    )
+    emitted = {}
+    with Simulator(config) as sim:
+        for name in ("idle", "geo-central", "geo-mpc"):
+            totals = simulate(sim, make_controller(name, sim.fleet), 96)
+            emitted[name] = emissions_g(
+                sim, totals.sums["carbon_g"], totals.sums["transfer_g"], 96
+            ).sum()
+            assert not totals.sums["dropped_tasks"].any()
+        assert totals.sums["sent_tasks"].sum() > 500
+        assert totals.sums["refused_tasks"].sum() < 0.02 * totals.sums["sent_tasks"].sum()
+        saved = {name: 1.0 - g / emitted["idle"] for name, g in emitted.items()}
+        assert saved["geo-central"] > 0.05
+        assert saved["geo-mpc"] > 0.95 * saved["geo-central"]
+        # The same view gives the same commands; a new episode begins with a new plan.
+        first, second = (make_controller("geo-mpc", sim.fleet) for _ in range(2))
+        sim.reset()
+        view = view_maker(sim)(None)
+        wanted = first.act(view)
+        assert first.act(view) is wanted
+        again = second.act(view)
+        assert wanted.transfer is not None
+        assert again.transfer is not None
+        assert np.array_equal(wanted.transfer, again.transfer)
+
+
+def test_the_study_of_fleets() -> None:
+    path = Path(__file__).parents[1] / "examples" / "fleet_study.py"
+    rows = runpy.run_path(str(path))["study"](0.4, [27], 32, ("AZ", "GA", "WA"))
+    assert rows["both"][0] > rows["both"][1] > 10
+    assert rows["time"][0] < rows["space"][0] < rows["both"][0]
+    bounds = [rows[f"link {x}"][0] for x in (0.02, 0.05, 0.1, 0.2)]
+    assert bounds == sorted(bounds)
+    assert rows["ratio 1"][0] < rows["ratio 0.3"][0] < rows["ratio 0.06"][0] < rows["both"][0]
+    assert rows["geo-all-cleaner"][1] < rows["geo-central"][1] < rows["both"][0]
+    assert 0.9 * rows["both"][0] < rows["geo-mpc"][1] < rows["both"][0]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import sdc_taichi
 from sdc_taichi import (
     Actions,
     ConfigError,
@@ -459,20 +458,3 @@ def test_other_bad_input() -> None:
         with Simulator(sim.fleet.configs[1:3]) as part:
             assert part.fleet.sites_per_fleet == 1
             assert np.array_equal(part.drivers.start, sim.drivers.start[1:3])
-
-
-def test_a_batch_of_environments_holds_whole_fleets_with_one_clock() -> None:
-    env = sdc_taichi.vector_env(8, config=fleet_of(), days=1, start="sampled")
-    _, infos = env.reset(seed=3)
-    fleet, drivers = env.core.sim.fleet, env.core.sim.drivers
-    assert (fleet.size, fleet.sites_per_fleet) == (8, 4)
-    utc = (drivers.start - drivers.utc_offset_h * 4) % (8760 * 4) / 96
-    assert np.array_equal(utc[:4], np.repeat(utc[0], 4))
-    assert np.array_equal(utc[4:], np.repeat(utc[4], 4))
-    assert utc[0] != utc[4]
-    assert len(infos["sent_tasks"]) == 8
-    env.close()
-    with pytest.raises(ConfigError, match="num_envs 3: valid is at least 4, one for each config"):
-        sdc_taichi.vector_env(3, config=fleet_of())
-    with pytest.raises(ConfigError, match="4 data centers; valid is one, or vector_env"):
-        sdc_taichi.parallel_env(config=fleet_of())

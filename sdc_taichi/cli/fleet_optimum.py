@@ -114,7 +114,10 @@ def _print(sim: Simulator, best: FleetOptimum, reached: Mapping[str, F64]) -> No
         *(f"{name} (% of the achievable)" for name in reached),
     ]
 
-    def column(take: Callable[[F64], float]) -> list[float | None]:
+    def column(fleets_of: slice) -> list[float | None]:
+        def take(figures: F64) -> float:
+            return float(figures[fleets_of].sum())
+
         idle, achieved = take(best.idle_g), take(best.achieved_g)
         of_idle = (best.cooled_g, best.stay_g, best.bound_g, best.achieved_g)
         return [
@@ -130,6 +133,6 @@ def _print(sim: Simulator, best: FleetOptimum, reached: Mapping[str, F64]) -> No
         f"{count_text(days, 'day')}, transfers included, batteries idle"
     )
     names = [f"{fleet.names[i]}..{fleet.names[i + sites - 1]}" for i in range(0, fleet.size, sites)]
-    columns = [column(lambda g, at=at: float(g[at])) for at in range(fleets)]
-    total = column(lambda g: float(g.sum()))
+    columns = [column(slice(at, at + 1)) for at in range(fleets)]
+    total = column(slice(None))
     console.print(figures_table(console, titles, names, columns, total, "z.2f"))

@@ -71,6 +71,7 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "geo-three-cleanest": _NamedController(lambda: Alone(three_cleanest), ("geo",)),
     "geo-all-cleaner": _NamedController(lambda: Alone(all_cleaner), ("geo",)),
     "geo-central": _NamedController(Central, ("geo",)),
+    "geo-mpc": _NamedController(lambda: _fleet_predictive(), ("load", "cooling", "geo")),
 }
 _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
@@ -247,12 +248,19 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )
-    if entry.parts == ("geo",) and fleet.sites_per_fleet == 1:
+    if name.startswith("geo-") and fleet.sites_per_fleet == 1:
         raise ConfigError(
             f"controller {name!r}: the data centers share no work; valid with a config that has "
             "section fleet, such as preset fleet_of_eight"
         )
     return entry.make()
+
+
+def _fleet_predictive() -> Controller:
+    """Make the predictive controller of fleets, whose module imports SciPy's programmes."""
+    from sdc_taichi.control.geo_mpc import FleetPredictive
+
+    return FleetPredictive()
 
 
 def _first_missing(parts: tuple[str, ...] | None, valid: Sequence[str]) -> str | None:

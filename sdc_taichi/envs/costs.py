@@ -55,7 +55,7 @@ def fleet_power(result: StepResult, view: View) -> F64:
     """Energy that a fleet draws above its power budget, in kWh, given to sites by their shares."""
     shared = view.fleet.shared_work
     assert shared is not None
-    return shared.excess(result.grid_kwh, shared.power_kw(view.sizing) * result.step_h)
+    return shared.excess(result.grid_kwh, shared.power_kw(view.sizing.facility_w) * result.step_h)
 
 
 def fleet_carbon(result: StepResult, view: View) -> F64:

@@ -108,6 +108,15 @@ class FacilityMap:
         best = (below + share[..., None] * (above - below)).argmin(axis=-1)
         return np.asarray(np.take_along_axis(self.setpoint_c[self.which], best, axis=1))
 
+    def least_kwh_in(self, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """Return the minimum energy of the allowed setpoints, in kWh, (B, H, I).
+
+        Args:
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+        """
+        return self._in_weather(self.least_kwh, *self.places_of_weather(outdoor_c, wet_bulb_c))
+
     def places_of_weather(self, outdoor_c: F64, wet_bulb_c: F64) -> tuple[F64, F64]:
         """Return fractional node indices of the weather on both axes, (B, H) each.
 

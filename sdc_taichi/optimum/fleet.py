@@ -24,7 +24,13 @@ import numpy as np
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.paths import cheapest_setpoints_c
-from sdc_taichi.optimum.problem import RAMP_K, Problem, no_table_reasons, problems_of
+from sdc_taichi.optimum.problem import (
+    RAMP_K,
+    FlexibleWork,
+    Problem,
+    no_table_reasons,
+    problems_of,
+)
 from sdc_taichi.optimum.programme import InfeasibleError, Linear, Programme
 from sdc_taichi.optimum.stage_cost import LoadCurves, load_curves, stage_cost
 from sdc_taichi.optimum.tables import facility_kwh, facility_tables
@@ -59,8 +65,8 @@ class Hub:
     """Most work that goes to each site in a step, in tasks, (S,)."""
     groups: tuple[tuple[int, ...], ...]
     """Sites of each residency group."""
-    delay_steps: int
-    """Steps from departure to arrival."""
+    delay_h: int
+    """Time from departure to arrival, in whole hours."""
     steps_per_hour: int
     """Number of steps in an hour."""
     half_weight: F64
@@ -68,6 +74,9 @@ class Hub:
     transfer times the weight of a kWh, (S, T)."""
     power_limit_kwh: float
     """Most energy of all facilities in a step, in kWh; inf without a limit."""
+    waiting_tasks: F64
+    """Work that waits at the start or is in flight then, in the step from which it can run, in
+    tasks, (S, T)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +92,14 @@ class FleetPlan:
 
 
 def fleet_plan(
-    problems: Sequence[Problem], curves: Sequence[LoadCurves], hub: Hub, *, move: bool = True
+    works: Sequence[FlexibleWork], curves: Sequence[LoadCurves], hub: Hub, *, move: bool = True
 ) -> FleetPlan:
     """Solve the linear programme of a fleet.
 
-    Queues are empty before the first and after the last step, and no work is in flight then.
+    Queues are empty after the last step, and no work is in flight then.
 
     Args:
-        problems: Planning problem of each of S sites.
+        works: Work of each of S sites.
         curves: Cost and energy of each site by executed work.
         hub: Limits of the transfers.
         move: False keeps all work at its site.
@@ -102,12 +111,12 @@ def fleet_plan(
 
     programme, base = Programme(), 0.0
     sent, got, run, power = [], [], [], []
-    steps, per_hour = problems[0].steps, hub.steps_per_hour
+    steps, per_hour = len(works[0].arrived_tasks), hub.steps_per_hour
     starts = np.arange(0, steps, per_hour)
-    delay, hours = hub.delay_steps // per_hour, len(starts)
+    delay, hours = hub.delay_h, len(starts)
     of_hour = np.diff(np.append(starts, steps)).astype(np.float64)
-    for s, (problem, curve) in enumerate(zip(problems, curves, strict=True)):
-        work, size, name = problem.work, len(curve.step), f"segment {s}"
+    for s, (work, curve) in enumerate(zip(works, curves, strict=True)):
+        size, name = len(curve.step), f"segment {s}"
         programme.variables(name, size, upper=curve.width_tasks, cost=curve.slope_cost)
         places = curve.step // per_hour, np.arange(size)
 
@@ -135,11 +144,12 @@ def fleet_plan(
         z = programme.variables(f"got {s}", hours, upper=most_got, cost=weight)
         q = programme.variables(f"queue {s}", hours, upper=work.queue_limit_tasks)
         landed = z.shifted(delay)
-        arrived = hourly(work.arrived_tasks)
+        waiting = hourly(hub.waiting_tasks[s])
+        arrived = hourly(work.arrived_tasks) + waiting
         programme.equal(f"balance {s}", q, q.before(0.0) - y + landed - executed + arrived)
         if work.deadline_steps is not None:
             came = programme.variables(f"came {s}", hours)
-            programme.equal(f"coming {s}", came, came.before(0.0) - y + landed + flexible)
+            programme.equal(f"coming {s}", came, came.before(0.0) - y + landed + flexible + waiting)
             deadline = -(-work.deadline_steps // per_hour)
             programme.at_most(f"deadline {s}", q, came - came.shifted(deadline))
         programme.equal(f"end {s}", q[-1], 0.0)
@@ -160,7 +170,7 @@ def fleet_plan(
     which = np.repeat(np.arange(hours), of_hour.astype(np.int64))
     flexible = hub.flexible_tasks
     shares = flexible / np.maximum(np.add.reduceat(flexible, starts, axis=1)[:, which], 1e-9)
-    flows = np.zeros((steps, len(problems), len(problems)))
+    flows = np.zeros((steps, len(works), len(works)))
     for group in hub.groups:
         rows = list(group)
         out, into = np.maximum(net[rows], 0.0).T, np.maximum(-net[rows], 0.0).T
@@ -168,6 +178,55 @@ def fleet_plan(
         pairs = out[:, :, None] * into[:, None, :] / np.where(total > 0.0, total, 1.0)
         flows[np.ix_(range(steps), rows, rows)] = pairs[which] * shares[rows].T[:, :, None]
     return FleetPlan(base + solution.figure, flows, np.stack(run, axis=1))
+
+
+class WorkCommands:
+    """Computes commands with which B data centers of fleets run and send given work.
+
+    Args:
+        fleet: F fleets of S sites.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._flexible_share = fleet.values("workload.flexible_share")
+        self._capacity = fleet.values("workload.max_utilisation") * TASKS_PER_STEP
+        self._due_entries = due_entries(queue_length(fleet), due_steps(fleet))
+
+    def at_site(self, state: State, demand: F64, flow: F64) -> F64:
+        """Return the work at each site that is not in its queue, in tasks, (B,).
+
+        Args:
+            state: State before the step.
+            demand: Work that arrives as a share of capacity, (B,).
+            flow: Work to send to each site of the fleet, in tasks, (B, S).
+        """
+        return np.asarray(demand * TASKS_PER_STEP - flow.sum(axis=1) + state.in_flight[:, 0])
+
+    def actions(
+        self, state: State, demand: F64, flow: F64, executed_tasks: F64, rise_c: F64
+    ) -> Actions:
+        """Return commands that come as close as possible to the given work.
+
+        Args:
+            state: State before the step.
+            demand: Work that arrives as a share of capacity, (B,).
+            flow: Work to send to each site of the fleet, in tasks, (B, S).
+            executed_tasks: Work to execute, in tasks, (B,).
+            rise_c: Cooling command of each CRAC unit, in steps of the setpoint, (U,).
+        """
+        flexible = self._flexible_share * demand * TASKS_PER_STEP
+        due = due_work(state.queue, self._due_entries)
+        forced = np.minimum(due, self._capacity)
+        at_site = self.at_site(state, demand, flow)
+        neutral = np.minimum(at_site, self._capacity - forced) + forced
+        drain = _share(executed_tasks - neutral, self._capacity - neutral)
+        may_wait = np.maximum(flexible - flow.sum(axis=1), 0.0) + state.in_flight[:, 0]
+        defer = _share(neutral - executed_tasks, may_wait)
+        return Actions(
+            load=np.where(executed_tasks >= neutral, drain, -defer),
+            cooling=rise_c,
+            transfer=flow / np.where(flexible > 0.0, flexible, 1.0)[:, None],
+        )
 
 
 class FleetFollower:
@@ -187,9 +246,7 @@ class FleetFollower:
         self._drivers, self._unit_dc = drivers, fleet.unit_dc
         self._flows = flows.reshape(len(flows), fleet.size, -1)
         self._queue_tasks, self._setpoint_c = queue_tasks, setpoint_c
-        self._flexible_share = fleet.values("workload.flexible_share")
-        self._capacity = fleet.values("workload.max_utilisation") * TASKS_PER_STEP
-        self._due_entries = due_entries(queue_length(fleet), due_steps(fleet))
+        self._commands = WorkCommands(fleet)
         self._step_k = fleet.values("hvac.setpoint.step_k")[fleet.unit_dc]
 
     def actions(self, state: State) -> Actions:
@@ -198,23 +255,13 @@ class FleetFollower:
         Args:
             state: State of the simulator before the step.
         """
-        flow, queue = self._flows[state.step], state.queue
-        arrived = self._drivers.at(state.step).demand * TASKS_PER_STEP
-        flexible = self._flexible_share * arrived
-        moved = state.in_flight[:, 0] - flow.sum(axis=1)
-        forced = np.minimum(due_work(queue, self._due_entries), self._capacity)
-        at_site = arrived + moved
-        neutral = np.minimum(at_site, self._capacity - forced) + forced
-        wanted = queue[:, -1] + at_site - self._queue_tasks[state.step]
-        drain = _share(wanted - neutral, self._capacity - neutral)
-        defer = _share(neutral - wanted, np.maximum(flexible + moved, 0.0))
+        flow, demand = self._flows[state.step], self._drivers.at(state.step).demand
+        at_site = self._commands.at_site(state, demand, flow)
+        executed = state.queue[:, -1] + at_site - self._queue_tasks[state.step]
         rise_k = self._setpoint_c[state.step][self._unit_dc] - state.setpoint_c
         rise_k = np.clip(rise_k, -RAMP_K, RAMP_K)
-        return Actions(
-            load=np.where(wanted >= neutral, drain, -defer),
-            cooling=avoid_repeats(rise_k / self._step_k, state.cooling_last),
-            transfer=flow / np.where(flexible > 0.0, flexible, 1.0)[:, None],
-        )
+        command = avoid_repeats(rise_k / self._step_k, state.cooling_last)
+        return self._commands.actions(state, demand, flow, executed, command)
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,29 +339,42 @@ def solve_fleet(
     problems = _problems(fleet, drivers, sizing, steps, sim.precision)
     stages = [stage_cost(problem) for problem in problems]
     curves = [load_curves(problem, stage) for problem, stage in zip(problems, stages, strict=True)]
-    stay, bound, flows, queues, setpoints = [], [], [], [], []
+    stay: list[float] = []
+    bound: list[float] = []
+    flows, queues, setpoints = list[F64](), list[F64](), list[F64]()
     for first in range(0, fleet.size, sites):
         part = slice(first, first + sites)
-        hub = _hub(fleet, shared, sizing, problems[part], first)
-        plans = []
-        for move in (False, True):
+        works = [problem.work for problem in problems[part]]
+        hub = hub_of(
+            fleet,
+            shared,
+            sizing,
+            first,
+            arrived_tasks=np.stack([work.arrived_tasks for work in works]),
+            kwh_weight=np.stack([problem.kwh_weight for problem in problems[part]]),
+        )
+        roomy = [
+            replace(w, queue_limit_tasks=with_room(w.queue_limit_tasks, shared)) for w in works
+        ]
+        try:
             check()
-            try:
-                plans.append(fleet_plan(problems[part], curves[part], hub, move=move))
-            except InfeasibleError:
-                # Without transfers, a limit of power may not hold.
-                if move:
-                    names = f"{fleet.names[first]} to {fleet.names[first + sites - 1]}"
-                    raise ConfigError(f"optimum of {names}: no plan satisfies the limits") from None
-                plans.append(None)
-        assert plans[1] is not None
-        stay.append(np.nan if plans[0] is None else plans[0].figure)
-        bound.append(plans[1].figure)
-        flows.append(plans[1].flow_tasks)
-        queues.append(_queue_tasks(problems[part], plans[1], shared.delay_steps))
+            plan = fleet_plan(roomy, curves[part], hub)
+            check()
+            bound.append(fleet_plan(works, curves[part], hub).figure)
+        except InfeasibleError:
+            names = f"{fleet.names[first]} to {fleet.names[first + sites - 1]}"
+            raise ConfigError(f"optimum of {names}: no plan satisfies the limits") from None
+        try:
+            check()
+            stay.append(fleet_plan(works, curves[part], hub, move=False).figure)
+        except InfeasibleError:
+            # Without transfers, the limit of the power cannot be met.
+            stay.append(np.nan)
+        flows.append(plan.flow_tasks)
+        queues.append(_queue_tasks(works, plan, shared.delay_steps))
         setpoints += [
             _cheapest_c(problem, executed)
-            for problem, executed in zip(problems[part], plans[1].executed_tasks.T, strict=True)
+            for problem, executed in zip(problems[part], plan.executed_tasks.T, strict=True)
         ]
     follower = FleetFollower(
         fleet,
@@ -343,6 +403,19 @@ def solve_fleet(
         achieved_g=achieved_g,
         table_error=error,
     )
+
+
+def with_room(queue_limit_tasks: float, shared: SharedWork) -> float:
+    """Return the longest queue of a plan, which leaves a site room for the work on its way to it.
+
+    A site takes no work for which its queue has no room (``sim.transfer``).
+
+    Args:
+        queue_limit_tasks: Longest queue, in tasks.
+        shared: Links of the fleets.
+    """
+    on_way_tasks = (shared.delay_steps + 1) * TASKS_PER_STEP
+    return max(queue_limit_tasks - on_way_tasks, 0.5 * queue_limit_tasks)
 
 
 def _problems(
@@ -374,10 +447,27 @@ def _problems(
     ]
 
 
-def _hub(
-    fleet: Fleet, shared: SharedWork, sizing: Sizing, problems: Sequence[Problem], first: int
+def hub_of(
+    fleet: Fleet,
+    shared: SharedWork,
+    sizing: Sizing,
+    first: int,
+    *,
+    arrived_tasks: F64,
+    kwh_weight: F64,
+    waiting_tasks: F64 | None = None,
 ) -> Hub:
-    """Return the limits of the fleet whose first data center has the index ``first``."""
+    """Return the limits of one fleet of a batch, with the delay rounded down to whole hours.
+
+    Args:
+        fleet: F fleets of S sites.
+        shared: Their links and budgets.
+        sizing: Their sized devices.
+        first: Index of the fleet's first data center.
+        arrived_tasks: Work that arrives at each site, in tasks, (S, T).
+        kwh_weight: Weight of a kWh at each site, (S, T).
+        waiting_tasks: See ``Hub``; None means no work.
+    """
     sites = fleet.sites_per_fleet
     part = slice(first, first + sites)
     allowed, site_tasks = shared.allowed[part] > 0.0, shared.site_tasks[part]
@@ -389,18 +479,18 @@ def _hub(
     share = fleet.values("workload.flexible_share")[part]
     kwh = transfer_kwh_per_task(fleet, sizing)[part]
     return Hub(
-        flexible_tasks=np.stack(
-            [x * p.work.arrived_tasks for x, p in zip(share, problems, strict=True)]
-        ),
+        flexible_tasks=share[:, None] * arrived_tasks,
         most_sent=np.minimum(pairs.sum(axis=1), site_tasks),
         most_got=np.minimum(pairs.sum(axis=0), site_tasks),
         groups=tuple(groups),
-        delay_steps=shared.delay_steps,
+        delay_h=shared.delay_steps // fleet.steps_per_hour,
         steps_per_hour=fleet.steps_per_hour,
-        half_weight=np.stack([0.5 * x * p.kwh_weight for x, p in zip(kwh, problems, strict=True)]),
+        half_weight=0.5 * kwh[:, None] * kwh_weight,
         power_limit_kwh=float(
-            np.nan_to_num(shared.power_kw(sizing)[first], nan=np.inf) * problems[0].step_h
+            np.nan_to_num(shared.power_kw(sizing.facility_w)[first], nan=np.inf)
+            / fleet.steps_per_hour
         ),
+        waiting_tasks=np.zeros(arrived_tasks.shape) if waiting_tasks is None else waiting_tasks,
     )
 
 
@@ -409,14 +499,14 @@ def _cheapest_c(problem: Problem, executed_tasks: F64) -> F64:
     return cheapest_setpoints_c(problem, np.minimum(executed_tasks / TASKS_PER_STEP, 1.0))
 
 
-def _queue_tasks(problems: Sequence[Problem], plan: FleetPlan, delay_steps: int) -> F64:
+def _queue_tasks(works: Sequence[FlexibleWork], plan: FleetPlan, delay_steps: int) -> F64:
     """Return the work in the queue of each site after each step, in tasks, (T, S)."""
     landed = np.zeros(plan.executed_tasks.shape)
     landed[delay_steps:] = plan.flow_tasks.sum(axis=1)[:-delay_steps]
-    arrived = np.stack([problem.work.arrived_tasks for problem in problems], axis=1)
+    arrived = np.stack([work.arrived_tasks for work in works], axis=1)
     rise = arrived - plan.flow_tasks.sum(axis=2) + landed - plan.executed_tasks
-    queue, waiting = np.empty(rise.shape), np.zeros(len(problems))
-    limit = np.array([problem.work.queue_limit_tasks for problem in problems])
+    queue, waiting = np.empty(rise.shape), np.zeros(len(works))
+    limit = np.array([work.queue_limit_tasks for work in works])
     for t, more in enumerate(rise):
         queue[t] = waiting = np.clip(waiting + more, 0.0, limit)
     return queue

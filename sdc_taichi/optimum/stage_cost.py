@@ -120,6 +120,20 @@ def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
         stage: Minimum cost and energy of each step.
     """
     least, most = work_limits(problem)
+    return curves_between(stage, least, most, weighs_water=problem.litre_weight > 0)
+
+
+def curves_between(
+    stage: StageCost, least: F64, most: F64, *, weighs_water: bool = False
+) -> LoadCurves:
+    """Compute the largest convex curves below cost and minimum energy for a range of work.
+
+    Args:
+        stage: Minimum cost and energy of each step.
+        least: Minimum executed work of each step, in tasks, (T,).
+        most: Maximum executed work of each step, in tasks, (T,).
+        weighs_water: True if cost is not proportional to energy.
+    """
     most = np.maximum(np.minimum(most, stage.highest_tasks), least)
     nodes = stage.executed_tasks
     x = np.concatenate(
@@ -128,7 +142,7 @@ def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
     cost = _lowered(nodes, stage.cost, least, most)
     kwh = _lowered(nodes, stage.least_facility_kwh, least, most)
     corner = _corners(x, cost)
-    if problem.litre_weight:
+    if weighs_water:
         of_energy = _corners(x, kwh)
         cost, kwh = _below(x, cost, corner), _below(x, kwh, of_energy)
         corner |= of_energy

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,6 @@ from sdc_taichi.config.fleet_schema import FleetConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
-
-if TYPE_CHECKING:
-    from sdc_taichi.sim.sizing import Sizing
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +56,13 @@ class SharedWork:
         excess = np.fmax(total - budget, 0.0)
         return np.asarray(excess * values / np.where(total > 0.0, total, 1.0))
 
-    def power_kw(self, sizing: Sizing) -> F64:
-        """Return the budget of the power of each site's fleet, in kW, (B,); nan for none."""
-        by_ratio_kw = self.power_limit_ratio * self.fleet_sums(sizing.facility_w) / 1e3
+    def power_kw(self, facility_w: F64) -> F64:
+        """Return the budget of the power of each site's fleet, in kW, (B,); nan for none.
+
+        Args:
+            facility_w: Design power of each facility, in W, (B,).
+        """
+        by_ratio_kw = self.power_limit_ratio * self.fleet_sums(facility_w) / 1e3
         return np.where(np.isnan(self.power_limit_kw), by_ratio_kw, self.power_limit_kw)
 
     @property
