@@ -40,7 +40,7 @@ class Game:
         width: numbers that a player decides.
     """
 
-    size: ClassVar = 32
+    size: int = 32
     rooms: ClassVar = 1
     length: ClassVar = 2
 
@@ -51,6 +51,7 @@ class Game:
         }
         self.learners = tuple(names)
         self.state_width = self.rooms
+        self.masks: dict[str, Tensor] = {}
         self.room = torch.zeros(self.size, dtype=torch.int64)
         self.turn = 0
 
@@ -87,7 +88,7 @@ class Game:
             self.room = self.first_room()
         rewards = {name: self.pay(i, pay) for i, name in enumerate(self.spaces)}
         team = torch.stack(list(rewards.values())).mean(0)
-        return StreamStep(rewards, team, ended, *after)
+        return StreamStep(rewards, rewards, team, ended, *after, self.masks)
 
     def state_dict(self) -> dict[str, Any]:
         return {"room": self.room.clone(), "turn": self.turn}
@@ -171,3 +172,59 @@ class Turnstile(Game):
 
     def first_room(self) -> Tensor:
         return torch.full_like(self.room, (self.turn // self.length) % 2)
+
+
+class Crowd(Game):
+    """A group of three agents beside a player; an agent sees its kind, which is its best choice.
+
+    Args:
+        down: agents of the group without effect, whose observations and rewards are random.
+        alone: whether the agents are those of three times as many tables, without the player.
+        discrete: whether agents choose among three, or else numbers within -1..1.
+    """
+
+    rooms = 3
+    count: ClassVar = 3
+
+    def __init__(
+        self, down: tuple[int, ...] = (), *, alone: bool = False, discrete: bool = True
+    ) -> None:
+        super().__init__(1, discrete)
+        choices = 3 if discrete else None
+        group = LearnerSpaces(("group",), 3, 1, choices, 1 if alone else self.count, bool(down))
+        self.spaces = {"group": group} if alone else {"group": group} | self.spaces
+        self.learners = tuple(self.spaces)
+        self.alone, self.noise = alone, torch.Generator().manual_seed(0)
+        self.acting = torch.ones(Game.size, self.count, dtype=torch.bool)
+        self.acting[:, list(down)] = False
+        if down:
+            self.masks = {"group": self.acting.flatten()}
+        if alone:
+            self.size = Game.size * self.count
+
+    @property
+    def state(self) -> Tensor:
+        return torch.ones(self.size, self.rooms)
+
+    @property
+    def observations(self) -> dict[str, Tensor]:
+        kinds = torch.arange(self.count).repeat(Game.size)
+        seen = torch.nn.functional.one_hot(kinds, 3).float()
+        random = torch.rand(seen.shape, generator=self.noise)
+        seen = torch.where(self.acting.flatten()[:, None], seen, random)
+        return {"group": seen} if self.alone else {"group": seen, "player_0": self.state}
+
+    def step(self, actions: dict[str, Tensor]) -> StreamStep:
+        kinds = torch.arange(self.count).repeat(Game.size)
+        pay = -(actions["group"][:, 0].float() - kinds).abs()
+        random = torch.rand(pay.shape, generator=self.noise)
+        acting = self.acting.flatten()
+        by_table = (pay * acting).view(self.size, -1).sum(1) / self.count
+        rewards, means = {"group": torch.where(acting, pay, random)}, {"group": by_table}
+        if not self.alone:
+            rewards["player_0"] = means["player_0"] = by_table + actions["player_0"][:, 0]
+        team = torch.stack(list(means.values())).mean(0)
+        self.turn += 1
+        ended = self.turn % self.length == 0
+        after = self.observations, self.state, self.masks
+        return StreamStep(rewards, means, team, ended, *after)

@@ -177,10 +177,17 @@ def test_damaged_and_foreign_files_are_one_error_that_names_the_file(tmp_path: P
             500 * x["interface"]["features"]["agent_bat"]
         ),
         lambda x: x["interface"].update(crac_units=10**12, commands={"agent_bat": ["cooling"]}),
+        lambda x: x["interface"].update(
+            agents=["crac"],
+            commands={"crac": ["fan"]},
+            features={"crac": x["interface"]["features"]["agent_bat"]},
+            own_policies=["crac"],
+            crac_units=10**12,
+        ),
         lambda x: x["networks"][0].update(sizes=[10**9, *x["networks"][0]["sizes"][1:]]),
         lambda x: x["networks"][0].update(choices=10**12),
     ],
-    ids=["entries", "more entries", "features", "units", "units of a layer", "choices"],
+    ids=["entries", "more entries", "features", "units", "policies", "units of a layer", "choices"],
 )
 def test_sizes_in_the_header_are_compared_with_the_weights_before_memory_is_taken(
     edit: Callable[[Any], None], tmp_path: Path
@@ -193,10 +200,12 @@ def test_sizes_in_the_header_are_compared_with_the_weights_before_memory_is_take
     edit(described)
     path.write_bytes(save(load(path.read_bytes()), {"policy": json.dumps(described)}))
     tracemalloc.start()
-    with pytest.raises(SdcError, match=WEIGHTS):
-        Policy.load(tmp_path)
-    _, peak_bytes = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
+    try:
+        with pytest.raises(SdcError, match=WEIGHTS):
+            Policy.load(tmp_path)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
     assert peak_bytes < 40 * path.stat().st_size + 1e6
 
 

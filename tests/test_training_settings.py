@@ -14,7 +14,7 @@ from sdc_taichi import EnvOptions
 from sdc_taichi.cli import train as train_command
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.terminal import duration
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.split import TRAINING
 from sdc_taichi.learning.training_settings import (
@@ -35,8 +35,29 @@ def test_settings_of_every_scenario_are_read_back_equal(scenario: str, tmp_path:
     assert load_settings(path) == made
     assert made.difference(load_settings(path)) is None
     configs = made.data_centers_of_weeks()
+    if scenario == "hall":
+        assert [config.name for config in configs] == ["ny"]
+        return
     assert len(configs) == 8 * len(TRAINING)
     assert {config.site.start for config in configs} >= {"01-01", "12-17"}
+
+
+def test_agents_of_halls_share_a_policy_unless_set() -> None:
+    hall = {"algorithm": "ippo", "scenario": "hall"}
+    shared = make_settings(hall)
+    assert shared.environment.agents == ("crac", "plant")
+    assert (shared.environment.fan_change, shared.environment.setpoint_change_k) == (0.1, 0.5)
+    assert "own_policies" not in shared.to_yaml()
+    apart = make_settings({**hall, "own_policies": ["crac"]})
+    assert make_settings(apart.model_dump(mode="json")) == apart
+    assert shared.difference(apart) is not None
+    for wrong, message in (
+        ({"own_policies": ["plant"]}, r"\['plant'\]; valid are groups .*: \['crac'\]"),
+        ({"own_policies": ["crac"], "algorithm": "ppo"}, "without effect with ppo"),
+        ({"own_policies": ["crac"], "scenario": None}, r"that learn: \[\]"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            make_settings({**hall, **wrong})
 
 
 def test_values_lie_on_top_of_those_of_their_scenario() -> None:

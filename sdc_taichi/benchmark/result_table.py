@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, shortened
-from sdc_taichi.learning.evaluation import ALL, METRICS
+from sdc_taichi.learning.evaluation import ALL, METRICS, MOVES
 from sdc_taichi.learning.split import WEEKS
-from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.user_file import decoding, open_parquet, read_parquet
@@ -83,7 +82,7 @@ METRIC_COLUMNS: Mapping[str, Column] = {
 }
 """Columns of the metrics of a run that the tables of suites contain."""
 SUITE_COLUMNS: Mapping[str, Column] = {
-    "moves": Column("text", texts=(ALL, *AGENTS, *WAYS)),
+    "moves": Column("text", texts=(ALL, *MOVES, *WAYS)),
     "site": Column("text"),
     "week": Column("whole number", high=WEEKS - 1),
     "figure": Column(),

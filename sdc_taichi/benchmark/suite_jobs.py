@@ -31,7 +31,7 @@ from sdc_taichi.benchmark.suite import Case, Part, Row
 from sdc_taichi.benchmark.suite_results import RowMetrics
 from sdc_taichi.config import validated
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, short_name
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import (
     ALL,
@@ -244,7 +244,7 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
         )
 
     agents = agents_of(settings_of(None))
-    moved = tuple(AGENT_DEFINITIONS[agent].command for agent in agents)
+    moved = tuple(short_name(agent) for agent in agents)
     files: dict[str, bytes] = {}
     metrics, specs = {}, []
     for agent in agents if task.row.apart else (None,):

@@ -195,10 +195,10 @@ def _settings(
 
 def _agents(text: str) -> list[str]:
     """Parse a list of agents, each named by its command (such as ``load``) or its own name."""
-    from sdc_taichi.envs.agents import AGENT_DEFINITIONS
+    from sdc_taichi.envs.agents import ALL_AGENTS, short_name
 
-    by_name = {d.command: agent for agent, d in AGENT_DEFINITIONS.items()}
-    by_name |= {agent: agent for agent in AGENT_DEFINITIONS}
+    by_name = {short_name(agent): agent for agent in ALL_AGENTS}
+    by_name |= {agent: agent for agent in ALL_AGENTS}
     names = []
     for name in (part.strip() for part in text.split(",")):
         if name not in by_name:

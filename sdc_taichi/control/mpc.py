@@ -78,7 +78,7 @@ class ModelPredictive:
 
     Args:
         hours: Horizon, in h.
-        objective: Quantity that the plan minimises; it must not include water.
+        objective: Quantity that the plan minimises; it must not include water or heat.
         agents: Agents whose commands the controller gives; it assumes neutral commands of the
             others.
 
@@ -86,7 +86,7 @@ class ModelPredictive:
         commands: Fields of ``Actions`` that the controller gives.
 
     Raises:
-        ConfigError: The horizon is out of bounds, or the objective includes water.
+        ConfigError: The horizon is out of bounds, or the objective includes water or heat.
     """
 
     def __init__(
@@ -100,11 +100,12 @@ class ModelPredictive:
                 f"controller 'mpc-{hours:g}h': valid is a horizon of "
                 f"{HORIZON_H[0]:g}..{HORIZON_H[1]:g} h, such as mpc-24h"
             )
-        if objective.water:
-            raise ConfigError(
-                f"controller 'mpc-{hours:g}h:{objective}': water is not planned; valid are carbon, "
-                "energy, cost, and sums of them"
-            )
+        for name in ("water", "heat"):
+            if getattr(objective, name):
+                raise ConfigError(
+                    f"controller 'mpc-{hours:g}h:{objective}': {name} is not planned; valid are "
+                    "carbon, energy, cost, and sums of them"
+                )
         self._hours, self._objective, self._agents = hours, objective, agents
         self.commands: tuple[str, ...] = agents
         self._planners: _Planners | None = None

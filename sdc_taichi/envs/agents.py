@@ -133,6 +133,32 @@ ALL_AGENTS: tuple[str, ...] = tuple(AGENT_DEFINITIONS)
 """Names of all groups, in the order of their actions and observations in joint environments."""
 
 
+def group_of(agent: str) -> str:
+    """Return the group of an agent; the name of a group is also returned unchanged."""
+    return agent if agent in AGENT_DEFINITIONS else agent.rpartition("_")[0]
+
+
+def short_name(group: str) -> str:
+    """Return the name of a group in tables and on the command line.
+
+    It is the command of an agent of the released SustainDC, such as ``cooling``, and the name of
+    any other group.
+    """
+    return AGENT_DEFINITIONS[group].command if group in AGENTS else group
+
+
+def members_of(group: str, units: int) -> tuple[str, ...]:
+    """Return the names of the agents of a group in one data center.
+
+    Args:
+        group: name of the group.
+        units: number of CRAC units of the data center.
+    """
+    if not AGENT_DEFINITIONS[group].per_unit:
+        return (group,)
+    return tuple(f"{group}_{i}" for i in range(units))
+
+
 def present_agents(agents: Sequence[str]) -> tuple[str, ...]:
     """Return the groups that exist beside those that learn, and these, in order.
 

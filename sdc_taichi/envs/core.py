@@ -35,6 +35,7 @@ from sdc_taichi.envs.agents import (
     AGENT_DEFINITIONS,
     HALL_AGENTS,
     commands_by_others,
+    members_of,
     present_agents,
 )
 from sdc_taichi.envs.costs import Costs
@@ -516,7 +517,7 @@ class Core:
     def _names_of(self, agent: str) -> tuple[str, ...]:
         """Return the names of the agents of a group in one environment."""
         if agent in self._of_units:
-            return tuple(f"{agent}_{i}" for i in range(self._slots.width))
+            return members_of(agent, self._slots.width)
         if self._sites == 1:
             return (agent,)
         sites = [config.site.location for config in self.sim.fleet.configs[: self._sites]]

@@ -666,17 +666,20 @@ def entries_of_new_features(
 
     Args:
         features_of: features of each agent, in the order of its observation. Each feature has a
-            ``size``, and equal objects count as the same feature.
+            ``name`` and a ``size``. Equal objects count as the same feature, except features of
+            CRAC units, and of different sites in names such as ``NY/agent_dc``.
     """
     known: set[Any] = set()
     out: dict[str, npt.NDArray[np.int64] | slice] = {}
     for agent, features in features_of.items():
-        new = np.repeat([f not in known for f in features], [f.size for f in features])
+        site = agent.rpartition("/")[0]
+        is_new = [f.name in _OF_UNITS or (site, f) not in known for f in features]
+        new = np.repeat(is_new, [f.size for f in features])
         entries = np.flatnonzero(new)
         # Indexing with a slice copies nothing, unlike indexing with an array.
         contiguous = len(entries) > 0 and entries[-1] - entries[0] == len(entries) - 1
         out[agent] = slice(int(entries[0]), int(entries[-1]) + 1) if contiguous else entries
-        known.update(features)
+        known.update((site, f) for f in features)
     return out
 
 

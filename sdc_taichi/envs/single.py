@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.envs.actions import checked_array
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.envs.base import (
     METADATA,
     HasSpec,
@@ -20,7 +22,7 @@ from sdc_taichi.envs.base import (
     start_day_option,
 )
 from sdc_taichi.envs.core import Core, Observation, Transition
-from sdc_taichi.envs.features import entries_of_new_features
+from sdc_taichi.envs.features import Feature, entries_of_new_features
 from sdc_taichi.envs.options import ConfigSource
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F32, F64
@@ -80,17 +82,21 @@ class JointLearner:
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._new_entries = entries_of_new_features(core.features)
-        self.features = tuple(dict.fromkeys(f for a in core.agents for f in core.features[a]))
-        boxes = {agent: _features_box(core, agent) for agent in core.agents}
-        low = np.concatenate([boxes[a].low[entries] for a, entries in self._new_entries.items()])
-        high = np.concatenate([boxes[a].high[entries] for a, entries in self._new_entries.items()])
+        self._new_entries, self.features = _joined_features(core)
+        boxes = [
+            (_features_box(core, group), len(names), self._new_entries[group])
+            for group, names in core.members.items()
+        ]
+        low = np.concatenate([np.tile(box.low, n)[entries] for box, n, entries in boxes])
+        high = np.concatenate([np.tile(box.high, n)[entries] for box, n, entries in boxes])
         features = spaces.Box(low, high, dtype=np.float32)
         first_space = core.observation_spaces[core.agents[0]]
         self.observation_space: spaces.Space[Any] = features
         if isinstance(first_space, spaces.Dict):
             self.observation_space = spaces.Dict({**first_space.spaces, "features": features})
-        self.action_space = _actions_side_by_side([core.action_spaces[a] for a in core.agents])
+        self.action_space = _actions_side_by_side(
+            [core.action_spaces[group] for group, names in core.members.items() for _ in names]
+        )
 
     def actions(self, values: Any) -> dict[str, Any]:
         """Split the learner's actions, (B, k), into actions by agent.
@@ -104,11 +110,12 @@ class JointLearner:
             raise SdcError(f"actions: shape {values.shape}, expected {shape}")
         out: dict[str, Any] = {}
         first = 0
-        for agent in self._core.agents:
-            size = self._core.action_spaces[agent].shape
-            width = size[0] if size else 1
-            out[agent] = values[:, first : first + width] if size else values[:, first]
-            first += width
+        for group, names in self._core.members.items():
+            size = self._core.action_spaces[group].shape or ()
+            end = first + len(names) * math.prod(size)
+            rows = () if names == (group,) else (len(names),)
+            out[group] = values[:, first:end].reshape(len(values), *rows, *size)
+            first = end
         return out
 
     def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
@@ -119,7 +126,11 @@ class JointLearner:
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
         """Concatenate observations by agent, with each feature once, (B, n)."""
-        parts = [_features(by_agent[a])[:, entries] for a, entries in self._new_entries.items()]
+        size = self._core.num_envs
+        parts = [
+            _features(by_agent[group]).reshape(size, -1)[:, entries]
+            for group, entries in self._new_entries.items()
+        ]
         features: F32 = np.concatenate(parts, axis=1)
         of_agent = by_agent[self._core.agents[0]]
         return {**of_agent, "features": features} if isinstance(of_agent, dict) else features
@@ -135,8 +146,12 @@ the environment."""
 
 
 def make_learner(core: Core, agent: str | None) -> Learner:
-    """Create the learner for one agent, or for all learning agents if ``agent`` is None."""
-    return JointLearner(core) if agent is None else AgentLearner(core)
+    """Create the learner for one agent, or for all learning agents if ``agent`` is None.
+
+    The agents of CRAC units have one learner together.
+    """
+    several = agent is None or AGENT_DEFINITIONS[agent].per_unit
+    return JointLearner(core) if several else AgentLearner(core)
 
 
 def learning_agent(agent: str | None, registered_agent: str | None) -> str | None:
@@ -154,6 +169,30 @@ def learning_agent(agent: str | None, registered_agent: str | None) -> str | Non
             f"agent {agent!r}: the one agent here is {registered_agent}; valid with another id"
         )
     return registered_agent or agent
+
+
+def _joined_features(
+    core: Core,
+) -> tuple[dict[str, npt.NDArray[np.int64] | slice], tuple[Feature, ...]]:
+    """Return which features a joint observation contains, so that each is there once.
+
+    Returns:
+        Entries of the observations of a group, one agent after another, by group; and the features
+        in the order of these entries.
+    """
+    groups = {agent: group for group, names in core.members.items() for agent in names}
+    new = entries_of_new_features({a: core.features[group] for a, group in groups.items()})
+    by_group: dict[str, npt.NDArray[np.int64] | slice] = {}
+    features: list[Feature] = []
+    for group, names in core.members.items():
+        of_agent = core.features[group]
+        numbers = np.arange(sum(f.size for f in of_agent))
+        feature_of_entry = np.repeat(np.arange(len(of_agent)), [f.size for f in of_agent])
+        for agent in names:
+            features += [of_agent[i] for i in np.unique(feature_of_entry[new[agent]])]
+        entries = [i * len(numbers) + numbers[new[agent]] for i, agent in enumerate(names)]
+        by_group[group] = new[group] if names == (group,) else np.concatenate(entries)
+    return by_group, tuple(features)
 
 
 def _features_box(core: Core, agent: str) -> spaces.Box:

@@ -109,8 +109,10 @@ class PolicyController:
         observer = self._observer_of(view)
         if not self._actions or view.state.step % self.policy.decision_steps == 0:
             self._actions = {
-                agent: chosen.reshape(len(chosen), *(self._decoder.spaces[agent].shape or ()))
-                for agent, chosen in self.policy.actions(observer.observe(view)).items()
+                group: chosen.reshape(
+                    *chosen.shape[:-1], *(self._decoder.spaces[group].shape or ())
+                )
+                for group, chosen in self.policy.actions(observer.observe(view)).items()
             }
         commands: dict[str, Any] = {**self._decoder.decode(self._actions, view)}
         if self._by_others:

@@ -5,8 +5,12 @@ fitted to the best candidates (Rubinstein and Kroese 2004). Noise is added to th
 deviations to prevent premature convergence, and decreases during the search (Szita and Lorincz
 2006).
 
+All agents of a group that shares a policy run the same candidate in a data center, and its return
+there is the mean of theirs.
+
 In shapes, B is the number of data centers, P the number of candidates, n the number of entries of
-an observation, m the number of scores, and k the number of actions.
+an observation, m the number of scores, and k the number of actions. R is the number of rows of a
+learner, as in module ``stream``.
 """
 
 from __future__ import annotations
@@ -170,23 +174,25 @@ class CrossEntropySearch:
         parameters = {name: drawn[name][tried[name]].astype(np.float32) for name in drawn}
         returns = {name: np.zeros(self._size) for name in drawn}
         sums = {name: np.zeros((2, s.seen_mean.size)) for name, s in self._searches.items()}
-        count, ended = 0, False
+        counts, ended = dict.fromkeys(drawn, 0), False
         while not ended:
-            count += self._size
             actions = {}
             for name, search in self._searches.items():
                 rows = stream.observations[name].numpy()
                 if not self._done:
-                    sums[name] += rows.sum(0, np.float64), np.square(rows, dtype=np.float64).sum(0)
+                    mask = stream.masks.get(name)
+                    seen = rows if mask is None else rows[mask.numpy()]
+                    counts[name] += len(seen)
+                    sums[name] += seen.sum(0, np.float64), np.square(seen, dtype=np.float64).sum(0)
                 scores = _scores(parameters[name], rows, search)
                 actions[name] = torch.from_numpy(_actions(scores, self._spaces[name].choices))
             after = stream.step(actions)
             ended = after.ended
-            for name, reward in after.rewards.items():
+            for name, reward in after.mean_rewards.items():
                 returns[name] += reward.numpy()
         if not self._done:
             for name, search in self._searches.items():
-                mean, square = sums[name] / count
+                mean, square = sums[name] / max(counts[name], 1)
                 search.seen_mean = mean
                 search.seen_std = np.sqrt(np.maximum(square - mean * mean, LEAST_STD**2))
         return returns
@@ -221,14 +227,21 @@ def _figures(returns: F64, search: _Search) -> F64:
 
 
 def _scores(parameters: F32, inputs: F32, search: _Search) -> F32:
-    """Return the scores of the candidate that each data center runs, (B, m)."""
+    """Return the scores of the candidate that each data center runs, (R, m).
+
+    Args:
+        parameters: parameters of the candidate of each data center, (B, m, n + 1).
+        inputs: observations, (R, n).
+        search: state of the search of the learner.
+    """
     scaled = ((inputs - search.seen_mean) / search.seen_std).clip(-CLIP, CLIP).astype(np.float32)
-    product = np.matmul(parameters[:, :, :-1], scaled[:, :, None])[..., 0]
-    return np.asarray(product + parameters[:, :, -1])
+    by_dc = scaled.reshape(len(parameters), -1, scaled.shape[1])
+    product = np.matmul(parameters[:, None, :, :-1], by_dc[..., None])[..., 0]
+    return np.asarray(product + parameters[:, None, :, -1]).reshape(len(inputs), -1)
 
 
 def _actions(scores: F32, choices: int | None) -> F32 | I64:
-    """Convert scores to actions, (B, k): option indices, or numbers within -1..1."""
+    """Convert scores to actions, (R, k): option indices, or numbers within -1..1."""
     if choices is not None:
         return np.asarray(scores.reshape(len(scores), -1, choices).argmax(2))
     return scores.clip(-1.0, 1.0)

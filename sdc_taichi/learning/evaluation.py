@@ -21,8 +21,16 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS
+from sdc_taichi.control import (
+    PERFECT,
+    Controller,
+    ForecastError,
+    Idle,
+    PerAgent,
+    View,
+    commands_of,
+)
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, ALL_AGENTS, short_name
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.policy import Policy
@@ -42,7 +50,7 @@ from sdc_taichi.sim.bills import no_demand
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.types import F64, I64, Actions, StepResult
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,6 +59,8 @@ IDLE = "idle"
 """Name of the baseline controller, which gives no commands."""
 ALL = "all"
 """Value of column ``moves`` for a run in which all agents of a controller act."""
+MOVES = tuple(short_name(agent) for agent in ALL_AGENTS)
+"""Values of column ``moves`` for runs in which a single group of agents acts."""
 METRICS = (
     *("cfp_kg", "grid_kwh", "it_kwh", "hvac_kwh", "water_l", "cost", "peak_kw"),
     *("over_27_degree_h", "hottest_inlet_c", "arrived_tasks", "executed_tasks", "dropped_tasks"),
@@ -125,7 +135,7 @@ class Contender:
     seed: int | None = None
     """Seed of the training of the controller; None if it was not trained."""
     agents: tuple[str, ...] = ()
-    """Agents (load, cooling, battery) that also run one at a time while the others are idle."""
+    """Agents, as in ``MOVES``, that also run one at a time while the others are idle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +280,7 @@ def check_contenders(contenders: Iterable[Contender]) -> None:
 
     Raises:
         ConfigError: two controllers have the same name and seed, a controller is called ``idle`` or
-            ``optimum``, or an agent is neither load, cooling nor battery.
+            ``optimum``, or an agent is not in ``MOVES``.
     """
     names = set()
     for each in contenders:
@@ -283,8 +293,8 @@ def check_contenders(contenders: Iterable[Contender]) -> None:
             raise ConfigError(f"evaluation: {each.name}{of} is given twice; valid is each once")
         names.add((each.name, each.seed))
         for agent in each.agents:
-            if agent not in AGENTS:
-                raise ConfigError(f"agent {agent!r} of {each.name}: valid are {', '.join(AGENTS)}")
+            if agent not in MOVES:
+                raise ConfigError(f"agent {agent!r} of {each.name}: valid are {', '.join(MOVES)}")
 
 
 def evaluate(
@@ -319,8 +329,10 @@ def evaluate(
             continue
         on_step = None if on_run is None else on_run(name)
         controller = contender.controller
-        if moves != ALL:
+        if moves in AGENTS:
             controller = PerAgent(*(controller if a == moves else Idle() for a in AGENTS))
+        elif moves != ALL:
+            controller = _OneGroup(controller, moves)
         frame = _rows(weeks, controller, on_step, stop)
         if frame is None:
             missing.append(name)
@@ -341,6 +353,34 @@ def evaluate(
         strata=weeks.strata,
         missing=tuple(dict.fromkeys(missing)),
     )
+
+
+class _OneGroup:
+    """Controller whose commands take effect for a single group of agents.
+
+    Args:
+        controller: gives the commands.
+        group: name of the group.
+
+    Attributes:
+        commands: fields of ``Actions`` that the controller gives.
+    """
+
+    def __init__(self, controller: Controller, group: str) -> None:
+        self._controller = controller
+        decided: Sequence[str] = AGENT_DEFINITIONS[group].commands
+        if isinstance(controller, PolicyController):
+            decided = controller.policy.interface.commands[group]
+        self.commands = tuple(name for name in commands_of(controller) if name in decided)
+
+    def reset(self, seed: int | I64) -> None:
+        """Begin a new episode."""
+        self._controller.reset(seed)
+
+    def act(self, view: View) -> Actions:
+        """Return the commands of the group."""
+        actions = self._controller.act(view)
+        return Actions(**{name: getattr(actions, name) for name in self.commands})
 
 
 def _runs(
@@ -477,7 +517,7 @@ def contenders_of(
     contenders = []
     for folder, policy, key in zip(folders, policies, keys, strict=True):
         controller = PolicyController(policy, fleet, f"policy {folder}")
-        parts = tuple(AGENT_DEFINITIONS[agent].command for agent in policy.interface.agents)
+        parts = tuple(short_name(agent) for agent in policy.interface.agents)
         alone = parts if agents_alone and len(parts) > 1 else ()
         contenders.append(Contender(names[key], controller, policy.about.seed, alone))
     return contenders

@@ -20,7 +20,7 @@ import numpy as np
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import ConfigError, SdcError, printable
-from sdc_taichi.learning.evaluation import ALL, IDLE, DataCenterWeeks, Evaluation
+from sdc_taichi.learning.evaluation import ALL, IDLE, MOVES, DataCenterWeeks, Evaluation
 from sdc_taichi.learning.policy import Policy
 from sdc_taichi.learning.statistics import (
     Statistic,
@@ -30,7 +30,6 @@ from sdc_taichi.learning.statistics import (
     probability_of_improvement,
     share_pct,
 )
-from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.run.achievable import OPTIMUM
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import list_folder
@@ -120,7 +119,7 @@ def by_agent(evaluation: Evaluation) -> pd.DataFrame:
     import pandas as pd
 
     table = []
-    for agent in AGENTS:
+    for agent in MOVES:
         best = evaluation.alone.get(agent)
         for name, rows in _groups(evaluation, agent):
             alone = math.nan if best is None else float(change_pct(best[None], _base(rows)))

@@ -2,7 +2,8 @@
 
 The graph has one input per agent, named after the agent: its unnormalised observations, f32
 (batch, n). For each agent it has the outputs ``AGENT_action``, (batch, k), and ``AGENT_scores``,
-which are the outputs of the network's last layer.
+which are the outputs of the network's last layer. A group of agents that shares a policy has one
+input, named after the group, with a row for each agent: (rows, n).
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ def export_onnx(policy: Policy, path: Path) -> None:
             'onnx is not installed; valid is after pip install "sdc-taichi[onnx]"'
         ) from None
     graph = _Graph(onnx)
-    for agent in policy.interface.agents:
-        graph.add_input(agent, policy.interface.width(agent))
+    for group in policy.interface.agents:
+        for agent in policy.interface.policies_of(group):
+            graph.add_input(agent, policy.interface.width(agent), _rows_of(policy, agent))
     for number, network in enumerate(policy.networks):
         _add_network(graph, policy, number, network)
     metadata = {
@@ -79,8 +81,17 @@ def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetw
         first += len(numbers)
         scores = (numbers[:, None] * scores_of_number + np.arange(scores_of_number)).reshape(-1)
         kind = np.int64 if discrete else np.float32
-        graph.add_output(f"{agent}_action", graph.columns(actions, numbers), len(numbers), kind)
-        graph.add_output(f"{agent}_scores", graph.columns(x, scores), len(scores), np.float32)
+        for name, source, columns, element in (
+            ("action", actions, numbers, kind),
+            ("scores", x, scores, np.float32),
+        ):
+            chosen, rows = graph.columns(source, columns), _rows_of(policy, agent)
+            graph.add_output(f"{agent}_{name}", chosen, len(columns), rows, element)
+
+
+def _rows_of(policy: Policy, agent: str) -> str:
+    """Return the name of the first dimension of an agent's inputs and outputs."""
+    return "rows" if policy.is_shared(agent) else "batch"
 
 
 def _actions(graph: _Graph, network: PolicyNetwork, scores: str, discrete: bool) -> str:
@@ -116,14 +127,14 @@ class _Graph:
         self._inputs: list[Any] = []
         self._outputs: list[Any] = []
 
-    def add_input(self, name: str, width: int) -> None:
-        """Add an input, f32 (batch, width)."""
-        self._inputs.append(self._value(name, width, np.float32))
+    def add_input(self, name: str, width: int, rows: str) -> None:
+        """Add an input, f32 (rows, width), whose first dimension has the name ``rows``."""
+        self._inputs.append(self._value(name, width, rows, np.float32))
 
-    def add_output(self, name: str, source: str, width: int, kind: Any) -> None:
-        """Add an output ``name``, (batch, width), that equals the value ``source``."""
+    def add_output(self, name: str, source: str, width: int, rows: str, kind: Any) -> None:
+        """Add an output ``name``, (rows, width), that equals the value ``source``."""
         self._nodes.append(self._onnx.helper.make_node("Identity", [source], [name]))
-        self._outputs.append(self._value(name, width, kind))
+        self._outputs.append(self._value(name, width, rows, kind))
 
     def constant(self, values: npt.ArrayLike) -> str:
         """Add a constant and return its name."""
@@ -156,6 +167,6 @@ class _Graph:
         self._onnx.checker.check_model(model)
         return model
 
-    def _value(self, name: str, width: int, kind: Any) -> Any:
+    def _value(self, name: str, width: int, rows: str, kind: Any) -> Any:
         element = self._onnx.helper.np_dtype_to_tensor_dtype(np.dtype(kind))
-        return self._onnx.helper.make_tensor_value_info(name, element, ["batch", width])
+        return self._onnx.helper.make_tensor_value_info(name, element, [rows, width])

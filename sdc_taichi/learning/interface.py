@@ -13,7 +13,13 @@ from pydantic import Field, model_validator
 
 from sdc_taichi.config.fields import Section
 from sdc_taichi.envs.actions import AgentActions, equal_number
-from sdc_taichi.envs.agents import Agent
+from sdc_taichi.envs.agents import (
+    AGENT_DEFINITIONS,
+    HALL_AGENTS,
+    Agent,
+    group_of,
+    members_of,
+)
 from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import EnvOptions, make_options
@@ -64,27 +70,45 @@ class Interface(Section):
     step_min: int = Field(ge=1, le=60)
     """Length of a step, in min."""
     crac_units: int | None = Field(ge=1)
-    """Number of CRAC units that an agent controls in a data center; None if no agent controls CRAC
-    units."""
+    """Number of CRAC units of a data center that the networks control together; None if no network
+    controls CRAC units, or one that controls each unit alone."""
     racks: int | None = Field(ge=1)
     """Number of racks on which an agent places work in a data center; None if no agent places
     work."""
+    own_policies: tuple[Agent, ...] = ()
+    """Groups whose agents do not share a policy, so that the number of CRAC units is fixed."""
+    sites: int | None = Field(default=None, ge=2)
+    """Number of sites of a fleet among which an agent moves work; None if no agent moves work."""
+    neighbours: int | None = Field(default=None, ge=0, le=8)
+    """Number of neighbouring CRAC units that an agent ``crac`` observes; None without such
+    agents."""
 
     @model_validator(mode="after")
     def _of_all_agents(self) -> Interface:
         for name in ("commands", "features"):
             if set(getattr(self, name)) != set(self.agents):
                 raise ValueError(f"{name}: valid are those of agents {', '.join(self.agents)}")
+        of_units = [agent for agent in self.agents if AGENT_DEFINITIONS[agent].per_unit]
+        if not set(self.own_policies) <= set(of_units):
+            raise ValueError(f"own_policies {list(self.own_policies)}; valid are {of_units}")
+        if self.own_policies and self.crac_units is None:
+            raise ValueError("crac_units: None; valid with own_policies is their number")
         return self
 
+    def policies_of(self, group: str) -> tuple[str, ...]:
+        """Return what the networks act for: the group, or each of its agents."""
+        return members_of(group, self.crac_units or 0) if group in self.own_policies else (group,)
+
     def width(self, agent: str) -> int:
-        """Return the number n of entries of an agent's observation."""
-        return sum(feature.size for feature in self.features[agent])
+        """Return the number n of entries of the observation of an agent, or of one of a group."""
+        return sum(feature.size for feature in self.features[group_of(agent)])
 
     def action_width(self, agent: str) -> int:
-        """Return the number k of entries of an agent's action."""
-        numbers = {"cooling": self.crac_units, "fan": self.crac_units, "placement": self.racks}
-        return sum(numbers.get(name) or 1 for name in self.commands[agent])
+        """Return the number k of entries of the action of an agent, or of one of a group."""
+        numbers = {"placement": self.racks, "transfer": (self.sites or 1) - 1}
+        if group_of(agent) not in HALL_AGENTS:
+            numbers |= {"cooling": self.crac_units, "fan": self.crac_units}
+        return sum(numbers.get(name) or 1 for name in self.commands[group_of(agent)])
 
     def options(self, **others: Any) -> EnvOptions:
         """Return options of environments that have this interface.
@@ -100,6 +124,7 @@ class Interface(Section):
             "setpoint_change_k": self.setpoint_change_k,
             "fan_change": self.fan_change,
             "observations": self.observations,
+            "neighbours": self.neighbours,
         }
         if self.observations == "default":
             options["features"] = {
@@ -137,7 +162,7 @@ class Interface(Section):
             reason: str | None = f"step: {self.step_min} min in training, {step_min} min here"
         else:
             try:
-                reason = self.difference(interface_of(fleet, self.options()))
+                reason = self.difference(interface_of(fleet, self.options(), self.own_policies))
             except ConfigError as error:
                 reason = str(error)
         if reason is not None:
@@ -152,24 +177,30 @@ _LABELS = {
     "commands": "commands",
     "setpoint_change_k": "setpoint_change_k",
     "fan_change": "fan_change",
+    "neighbours": "neighbours",
     "step_min": "step in min",
     "ci_leads_h": "ci_leads_h",
     "weather_leads_h": "weather_leads_h",
     "crac_units": "CRAC units (hvac.crac.units)",
     "racks": "racks",
+    "sites": "sites",
 }
 """Name of each field of ``Interface`` in messages, in the order of comparison."""
 
 
-def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
+def interface_of(
+    fleet: Fleet, options: EnvOptions, own_policies: Sequence[Agent] = ()
+) -> Interface:
     """Return the interface of environments to the policies of their learning agents.
 
     Args:
         fleet: the data centers.
         options: options of the environments.
+        own_policies: groups whose agents do not share a policy.
 
     Raises:
-        ConfigError: the options do not fit the data centers, or observations contain heat maps.
+        ConfigError: the options do not fit the data centers, or observations contain heat maps; or
+            the agents of CRAC units do not share a policy, and data centers differ in their number.
     """
     if options.heat_map:
         raise ConfigError("heat_map True: policies observe features alone; valid is False")
@@ -181,7 +212,8 @@ def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
     names = {name for commands in decided.values() for name in commands}
     continuous, named = options.actions == "continuous", options.observations == "default"
     has_order = not continuous and "battery" in names
-    on_units = bool(names & {"cooling", "fan"})
+    of_dc = set(decided.get("agent_dc", ()))
+    on_units = bool(own_policies) or not of_dc.isdisjoint(("cooling", "fan"))
     on_racks = "placement" in names
     return Interface(
         agents=options.agents,
@@ -197,6 +229,9 @@ def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
         step_min=60 // fleet.steps_per_hour,
         crac_units=equal_number(fleet.unit_offsets, "CRAC units") if on_units else None,
         racks=equal_number(fleet.rack_offsets, "racks") if on_racks else None,
+        own_policies=tuple(own_policies),
+        sites=fleet.sites_per_fleet if "transfer" in names else None,
+        neighbours=options.neighbours if "crac" in options.agents else None,
     )
 
 

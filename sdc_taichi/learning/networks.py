@@ -71,6 +71,8 @@ class RunningMoments:
     def add(self, rows: Tensor) -> None:
         """Update the moments with rows, (n, width)."""
         n = len(rows)
+        if not n:
+            return
         row_mean = rows.mean(0)
         # This is many times faster than Tensor.var, which iterates over single rows.
         variance = (rows - row_mean).square_().mean(0).double()

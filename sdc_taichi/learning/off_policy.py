@@ -18,6 +18,10 @@ updated one after another in random order. The algorithms differ in V and in tha
   value: the expected value under the policies plus the policies' entropies, weighted by
   temperatures. The learners maximise the soft value.
 
+Agents of a group that shares a policy are rows of one learner, but the critics take the actions of
+each of them. The steps in which an agent is without effect, because its CRAC unit is down, are left
+out of the losses of its learner.
+
 The published HASAC has an additional temperature for the critic. Here V uses the temperatures of
 the learners, so that critic and learners have the same objective.
 """
@@ -86,14 +90,21 @@ class OffPolicy:
         self._done = 0
         self._generators = generators(seed)
         self._columns = _columns(self._spaces, stream.state_width)
-        self._numbers = sum(of.action_width for of in self._spaces.values())
+        self._numbers = _numbers(self._spaces)
         self._soft = definition.soft
         self._critic, self._actors = _critic_and_actors(
             definition, settings, self._spaces, stream.state_width, self._generators["weights"]
         )
         self._targets = [x.detach().clone() for x in self._critic.parameters]
         self._adam = adam(self._critic.parameters, settings.rate)
-        self._moments = RunningMoments(self._columns[-1][1].stop)
+        plain = [STATE, *(name for name, of in self._spaces.items() if not _has_rows(of))]
+        self._plain = slice(self._columns[plain[-1]].stop)
+        self._moments = RunningMoments(self._plain.stop)
+        self._unit_moments = {
+            name: RunningMoments(of.observation_width)
+            for name, of in self._spaces.items()
+            if _has_rows(of)
+        }
         self._rewards = RunningMoments(1)
         self._returns = RunningMoments(1)
         self._running_return = torch.zeros(0)
@@ -130,14 +141,15 @@ class OffPolicy:
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
         """Return the current policies without randomness (highest score, or mean action)."""
-        columns = dict(self._columns)
-        mean, std = self._moments.mean.float().numpy(), self._moments.std.numpy()
         networks = []
         for name, sizes in self._spaces.items():
             *inner, (weight, bias) = layers_of(self._actors.nets[name])
             outputs = sizes.action_width * (sizes.choices or 1)
             layers = (*inner, (weight[:outputs], bias[:outputs]))
-            moments = mean[columns[name]], std[columns[name]]
+            seen, part = self._moments, self._columns[name]
+            if name in self._unit_moments:
+                seen, part = self._unit_moments[name], slice(None)
+            moments = seen.mean.float().numpy()[part], seen.std.numpy()[part]
             activation = self._settings.activation
             networks.append(policy_network(layers, *moments, sizes, activation, "tanh"))
         return tuple(networks)
@@ -176,13 +188,15 @@ class OffPolicy:
             self._replay.load_state_dict(values["replay"])
 
     def _all_moments(self) -> dict[str, RunningMoments]:
-        return {"seen": self._moments, "rewards": self._rewards, "returns": self._returns}
+        of_units = {f"seen/{name}": moments for name, moments in self._unit_moments.items()}
+        of_all = {"seen": self._moments, "rewards": self._rewards, "returns": self._returns}
+        return of_all | of_units
 
     def _new_replay(self, num_envs: int) -> Replay:
         return Replay(
             self._settings.replay_size,
             num_envs,
-            self._columns[-1][1].stop,
+            max(part.stop for part in self._columns.values()),
             self._numbers,
             steps=self._settings.n_steps,
             discount=self._settings.discount,
@@ -196,22 +210,32 @@ class OffPolicy:
         situations = []
         with torch.no_grad():
             for _ in range(self._settings.rollout_decisions):
-                before = torch.cat([stream.state, *(stream.observations[n] for n in rewards)], 1)
+                before = self._joined(stream.state, stream.observations, stream.masks)
                 situations.append(before)
                 actions = self._actors.act(
                     self._situation(before), self.exploration, self._generators["actions"]
                 )
-                parts = self._actors.numbers.items()
-                after = stream.step({name: actions[:, part] for name, part in parts})
+                after = stream.step(
+                    {
+                        name: actions[:, part].reshape(-1, self._spaces[name].action_width)
+                        for name, part in self._actors.numbers.items()
+                    }
+                )
                 reward = after.team
                 replay.add(before, actions, reward)
                 self._measure(reward)
                 if after.ended:
-                    ends = (after.next_observations[n] for n in rewards)
-                    replay.end(torch.cat([after.next_state, *ends], 1))
+                    ends = after.next_state, after.next_observations, after.next_masks
+                    replay.end(self._joined(*ends))
                 for name in rewards:
-                    rewards[name] += after.rewards[name].mean()
-            self._moments.add(torch.cat(situations))
+                    rewards[name] += after.mean_rewards[name].mean()
+            together = torch.cat(situations)
+            self._moments.add(together[:, self._plain])
+            for name, moments in self._unit_moments.items():
+                rows = together[:, self._columns[name]].reshape(-1, len(moments.mean))
+                if self._spaces[name].has_mask:
+                    rows = rows[together[:, self._columns[_mask_of(name)]].flatten() > 0]
+                moments.add(rows)
         steps = self._settings.rollout_decisions * self._settings.decision_steps
         logged = {f"reward/{n}": float(x) / steps for n, x in rewards.items()}
         return logged if self._soft else logged | {"exploration": self.exploration}
@@ -226,10 +250,27 @@ class OffPolicy:
         self._returns.add(self._running_return.unsqueeze(-1))
 
     def _situation(self, columns: Tensor) -> Situation:
-        """Normalise concatenated shared states and observations, (N, m + n), and split them."""
-        normal = self._moments.normalise(columns)
-        state, *others = ((name, normal[:, part]) for name, part in self._columns)
-        return Situation(state[1], dict(others))
+        """Split the columns from ``_joined``, (N, width), and normalise states and observations."""
+        normal = self._moments.normalise(columns[:, self._plain])
+        observations, masks = {}, {}
+        for name, of in self._spaces.items():
+            part = self._columns[name]
+            if name not in self._unit_moments:
+                observations[name] = normal[:, part]
+                continue
+            rows = columns[:, part].reshape(-1, of.observation_width)
+            observations[name] = self._unit_moments[name].normalise(rows)
+            if of.has_mask:
+                masks[name] = columns[:, self._columns[_mask_of(name)]] > 0
+        return Situation(normal[:, self._columns[STATE]], observations, masks)
+
+    def _joined(
+        self, state: Tensor, observations: Mapping[str, Tensor], masks: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Concatenate shared states, observations and masks of each environment, (B, width)."""
+        parts = {STATE: state, **observations}
+        parts |= {_mask_of(name): mask.float() for name, mask in masks.items()}
+        return torch.cat([parts[name].reshape(len(state), -1) for name in self._columns], 1)
 
     # Learning
 
@@ -284,11 +325,34 @@ def critic_loss(values: Tensor, targets: Tensor) -> Tensor:
     return 0.5 * (values - targets).square().mean(-1).sum()
 
 
-def _columns(spaces: Mapping[str, LearnerSpaces], state_width: int) -> list[tuple[str, slice]]:
-    """Return the columns of shared state and each learner's observation when concatenated."""
-    widths = [(STATE, state_width), *((n, x.observation_width) for n, x in spaces.items())]
-    ends = list(accumulate(width for _, width in widths))
-    return [(n, slice(end - width, end)) for (n, width), end in zip(widths, ends, strict=True)]
+def _columns(spaces: Mapping[str, LearnerSpaces], state_width: int) -> dict[str, slice]:
+    """Return the columns of the shared state and of each learner when concatenated.
+
+    Those of learners with rows, which have moments of their own, and then the masks, come last.
+    """
+    plain = {n: x.observation_width for n, x in spaces.items() if not _has_rows(x)}
+    rows = {n: x.observation_width * x.count for n, x in spaces.items() if _has_rows(x)}
+    masks = {_mask_of(n): x.count for n, x in spaces.items() if x.has_mask}
+    widths = {STATE: state_width, **plain, **rows, **masks}
+    ends = accumulate(widths.values())
+    return {
+        n: slice(end - width, end) for (n, width), end in zip(widths.items(), ends, strict=True)
+    }
+
+
+def _has_rows(of: LearnerSpaces) -> bool:
+    """Return True if several agents share a policy, or agents may be without effect."""
+    return of.count > 1 or of.has_mask
+
+
+def _mask_of(learner: str) -> str:
+    """Return the name of the columns with the mask of a learner."""
+    return f"mask/{learner}"
+
+
+def _numbers(spaces: Mapping[str, LearnerSpaces]) -> int:
+    """Return the number of actions of all learners in an environment, K."""
+    return sum(of.action_width * of.count for of in spaces.values())
 
 
 def _critic_and_actors(
@@ -299,8 +363,7 @@ def _critic_and_actors(
     generator: torch.Generator,
 ) -> tuple[JointValues | ContinuousValues, GreedyActors | SoftActors | GaussianActors]:
     """Return the critics, and the policies that learn from them."""
-    numbers = sum(sizes.action_width for sizes in spaces.values())
-    shape = definition.critics, state_width, numbers, settings, generator
+    shape = definition.critics, state_width, _numbers(spaces), settings, generator
     levels = next(iter(spaces.values())).choices
     if levels is not None:
         table = JointValues(*shape, levels)

@@ -4,8 +4,10 @@ Learners are updated one after another in random order (Zhong et al. 2024). The 
 uses the new policies of the learners already updated and the old policies of the others, so that no
 two learners respond to the same possible improvement.
 
-In shapes, N is the batch size, K the number of actions of all learners together, k the number of
-one learner's actions, and L the number of levels of a discrete action.
+In shapes, N is the batch size, K the number of actions of all agents together, k the number of
+one learner's actions, and L the number of levels of a discrete action. If W agents share the policy
+of a learner, k is the number of all their actions. Agents without effect have constant actions, the
+first level or 0, so that they add nothing to losses and gradients.
 """
 
 from __future__ import annotations
@@ -30,6 +32,9 @@ from sdc_taichi.learning.stream import LearnerSpaces
 LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
 """Bounds of the logarithm of the standard deviation of actions before the hyperbolic tangent."""
 
+LEAST_SCORE = -1e4
+"""Score of a level that is never chosen; its probability is 0 in f32."""
+
 Values = TypeVar("Values", bound=JointValues | ContinuousValues)
 """Type of the critic: for discrete choices, or for continuous actions."""
 
@@ -40,7 +45,21 @@ class Situation(NamedTuple):
     state: Tensor
     """Shared state, (N, m)."""
     observations: dict[str, Tensor]
-    """Observations by learner, (N, n) each."""
+    """Observations by learner, (N, n) each, or (N W, n) if W agents share the policy."""
+    masks: dict[str, Tensor]
+    """True for agents that act, (N, W) each, by learner with a mask."""
+
+    def acting(self, learner: str, width: int) -> Tensor | None:
+        """Return True for the actions of agents that act, (N, width); None if all agents act.
+
+        Args:
+            learner: name of the learner.
+            width: number of actions of all its agents.
+        """
+        mask = self.masks.get(learner)
+        if mask is None or mask.all():
+            return None
+        return mask.repeat_interleave(width // mask.shape[1], dim=1)
 
 
 class Actors(Generic[Values]):
@@ -73,6 +92,7 @@ class Actors(Generic[Values]):
         self.nets: dict[str, nn.Sequential] = {}
         self.numbers: dict[str, slice] = {}
         self.adams: dict[str, torch.optim.Adam] = {}
+        self._counts = {name: of.count for name, of in spaces.items()}
         first = 0
         for name, of in spaces.items():
             self.nets[name] = net = perceptron(
@@ -84,8 +104,8 @@ class Actors(Generic[Values]):
                 generator=generator,
             )
             self.adams[name] = adam(net.parameters(), settings.rate)
-            self.numbers[name] = slice(first, first + of.action_width)
-            first += of.action_width
+            self.numbers[name] = slice(first, first + of.action_width * of.count)
+            first = self.numbers[name].stop
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that ``load_state_dict`` needs."""
@@ -102,13 +122,21 @@ class Actors(Generic[Values]):
 
     def _choice_outputs(self, situation: Situation) -> Tensor:
         """Return the network output for each level of each action, (N, K, L)."""
-        return torch.cat(
-            [
-                self.nets[name](inputs).unflatten(-1, (-1, self._outputs))
-                for name, inputs in situation.observations.items()
-            ],
-            dim=1,
-        )
+        return torch.cat([self._scores(name, situation) for name in self.nets], dim=1)
+
+    def _scores(self, name: str, situation: Situation) -> Tensor:
+        """Return the network output for each level of each action of a learner, (N, k, L).
+
+        Those of actions without effect select the first level.
+        """
+        scores = self.nets[name](situation.observations[name])
+        scores = scores.reshape(len(situation.state), -1, self._outputs)
+        acting = situation.acting(name, scores.shape[1])
+        if acting is None:
+            return scores
+        first_level = torch.full((self._outputs,), LEAST_SCORE)
+        first_level[0] = 0.0
+        return torch.where(acting[..., None], scores, first_level)
 
     def _descend(self, loss: Tensor, name: str) -> None:
         """Take a gradient step of a learner's network."""
@@ -141,9 +169,14 @@ class GreedyActors(Actors[JointValues]):
         """
         best = self._choice_outputs(situation).argmax(-1)
         explores = torch.rand(best.shape, generator=generator) < exploration
-        return torch.where(
+        chosen = torch.where(
             explores, torch.randint(self._outputs, best.shape, generator=generator), best
         )
+        for name, numbers in self.numbers.items():
+            acting = situation.acting(name, numbers.stop - numbers.start)
+            if acting is not None:
+                chosen[:, numbers] *= acting
+        return chosen
 
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
@@ -170,7 +203,9 @@ class GreedyActors(Actors[JointValues]):
             rows -= rows.mean(-1, keepdim=True)
         losses = {}
         for name, numbers in self.numbers.items():
-            loss = (outputs[:, numbers] - rows[:, numbers]).square().mean()
+            errors = (outputs[:, numbers] - rows[:, numbers]).square()
+            acting = situation.acting(name, errors.shape[1])
+            loss = errors.mean() if acting is None else _mean_of(errors.mean(-1), acting)
             self._descend(loss, name)
             losses[f"policy_loss/{name}"] = loss.detach()
         return losses
@@ -231,6 +266,12 @@ class EntropicActors(Actors[Values]):
                 log.copy_(torch.as_tensor(of["log"]))
             self._temperature_adams[name].load_state_dict(of["adam"])
 
+    def _per_agent(self, name: str, entropy: Tensor, situation: Situation) -> Tensor:
+        """Return the mean entropy of an agent that acts, from that of all such agents, (N,)."""
+        if name not in situation.masks:
+            return entropy.mean() / self._counts[name]
+        return entropy.sum() / situation.masks[name].sum().clamp_min(1)
+
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
         """Update the network and the temperature of a learner, and return values to log."""
         self._descend(loss, name)
@@ -283,15 +324,15 @@ class SoftActors(EntropicActors[JointValues]):
             free = range(*numbers.indices(probabilities.shape[1]))
             values = expected(table, probabilities, free)
             loss = soft_policy_loss(log_p[name], values, self.temperature(name))
-            logged |= self._step(name, loss, entropies(log_p[name].detach()).mean())
+            entropy = entropies(log_p[name].detach())
+            logged |= self._step(name, loss, self._per_agent(name, entropy, situation))
             with torch.no_grad():
                 probabilities[:, numbers] = self._log_p(name, situation).exp()
         return logged
 
     def _log_p(self, name: str, situation: Situation) -> Tensor:
         """Return the log-probability of each level of a learner's choices, (N, k, L)."""
-        scores = self.nets[name](situation.observations[name])
-        return scores.unflatten(-1, (-1, self._outputs)).log_softmax(-1)
+        return self._scores(name, situation).log_softmax(-1)
 
 
 class GaussianActors(EntropicActors[ContinuousValues]):
@@ -324,7 +365,8 @@ class GaussianActors(EntropicActors[ContinuousValues]):
             joint = torch.cat([actions[:, : numbers.start], part, actions[:, numbers.stop :]], 1)
             value = self._critic.of_actions(situation.state, joint).amin(0)
             loss = (self.temperature(name) * log_p - value).mean()
-            logged |= self._step(name, loss, -log_p.detach().mean())
+            entropy = self._per_agent(name, -log_p.detach(), situation)
+            logged |= self._step(name, loss, entropy)
             with torch.no_grad():
                 actions[:, numbers] = self._draw(name, situation, generator)[0]
         return logged
@@ -340,11 +382,21 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     def _draw(
         self, name: str, situation: Situation, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Draw the actions of a learner, (N, k); return them and their log-densities, (N,)."""
+        """Draw the actions of a learner, (N, k); return them and their log-densities, (N,).
+
+        Actions without effect are 0 and do not count in the log-densities.
+        """
         mean, log_std = self.nets[name](situation.observations[name]).chunk(2, dim=-1)
         log_std = log_std.clamp(LEAST_LOG_STD, MOST_LOG_STD)
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
-        return squashed(mean, log_std, noise)
+        actions, log_p = squashed(mean, log_std, noise)
+        size = len(situation.state)
+        actions = actions.reshape(size, -1)
+        acting = situation.acting(name, actions.shape[1])
+        if acting is not None:
+            actions = actions.where(acting, 0.0)
+            log_p = log_p.where(situation.masks[name].flatten(), 0.0)
+        return actions, log_p if len(log_p) == size else log_p.reshape(size, -1).sum(-1)
 
 
 def adam(parameters: Any, rate: float) -> torch.optim.Adam:
@@ -368,6 +420,11 @@ def descend(
     if norm < math.inf:
         nn.utils.clip_grad_norm_(parameters, norm)
     optimiser.step()
+
+
+def _mean_of(values: Tensor, chosen: Tensor) -> Tensor:
+    """Return the mean of the chosen elements, shape (); 0 if none is chosen."""
+    return values.where(chosen, 0.0).sum() / chosen.sum().clamp_min(1)
 
 
 def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: int) -> Tensor:

@@ -17,6 +17,11 @@ clipping:
   one after another in random order, and M_i is the product of the ratios r_j of the learners j that
   are already updated.
 - ``haa2c`` (Zhong et al. 2024) is ``happo`` without clipping, with a single pass over the steps.
+
+Each agent of a group that shares a policy is a row of one learner. A critic that takes the shared
+state therefore has the same value for all agents of a group. In M_i, the ratio of such a learner is
+the product over its agents. Steps in which an agent is without effect, because its CRAC unit is
+down, are left out of all losses and moments, and their ratio is 1.
 """
 
 from __future__ import annotations
@@ -54,7 +59,10 @@ class _Critic(NamedTuple):
 
 
 class _Rollout(NamedTuple):
-    """T decisions of B environments under fixed policies; tensors have shape (T, B, ...)."""
+    """T decisions of B environments under fixed policies.
+
+    Tensors of a learner have shape (T, R, ...), with its R rows; all others (T, B, ...).
+    """
 
     observations: dict[str, Tensor]
     next_observations: dict[str, Tensor]
@@ -63,8 +71,20 @@ class _Rollout(NamedTuple):
     actions: dict[str, Tensor]
     log_p: dict[str, Tensor]
     rewards: dict[str, Tensor]
+    mean_rewards: dict[str, Tensor]
+    masks: dict[str, Tensor]
     team: Tensor
     ended: Tensor
+
+    def acting(self, learner: str) -> Tensor | None:
+        """Return the indices of the rows, of T R, whose agents act; None if all agents act."""
+        mask = self.masks.get(learner)
+        return None if mask is None or mask.all() else mask.flatten().nonzero().squeeze(-1)
+
+    def teaches(self, learner: str) -> bool:
+        """Return True if agents of a learner act in at least two rows."""
+        acting = self.acting(learner)
+        return acting is None or len(acting) > 1
 
 
 class OnPolicy:
@@ -115,15 +135,17 @@ class OnPolicy:
         """
         rollout = self._collect(stream)
         steps = self._settings.decision_steps
-        logged = {f"reward/{n}": float(r.mean()) / steps for n, r in rollout.rewards.items()}
+        rewards = rollout.mean_rewards
+        logged = {f"reward/{name}": float(r.mean()) / steps for name, r in rewards.items()}
         self._done += 1
         if self._done > 1:
             self._anneal()
             logged |= self._learn(rollout)
         for name, moments in self._moments.items():
-            moments.add(rollout.observations[name].flatten(0, 1))
+            moments.add(_rows(rollout.observations[name].flatten(0, 1), rollout.acting(name)))
         for name, critic in self._critics.items():
-            critic.inputs.add(self._critic_inputs(name, rollout)[0].flatten(0, 1))
+            inputs = self._critic_inputs(name, rollout)[0].flatten(0, 1)
+            critic.inputs.add(_rows(inputs, rollout.acting(name)))
         return logged
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
@@ -179,7 +201,7 @@ class OnPolicy:
         decisions = []
         with torch.no_grad():
             for _ in range(self._settings.rollout_decisions):
-                state, observations = stream.state, stream.observations
+                state, observations, masks = stream.state, stream.observations, stream.masks
                 drawn = {
                     name: actor.sample(
                         self._moments[name].normalise(observations[name]),
@@ -198,6 +220,8 @@ class OnPolicy:
                         actions=actions,
                         log_p={name: log_p for name, (_, log_p) in drawn.items()},
                         rewards=after.rewards,
+                        mean_rewards=after.mean_rewards,
+                        masks=masks,
                         team=after.team,
                         ended=torch.tensor(float(after.ended)),
                     )
@@ -210,25 +234,34 @@ class OnPolicy:
         """Update each critic and then each policy from a rollout; return the values to log."""
         logged: dict[str, float] = {}
         advantages: dict[str, Tensor] = {}
+        # A learner none of whose agents acts, because all their units are down, learns nothing.
+        learners = [name for name in self._spaces if rollout.teaches(name)]
         for name in self._critics:
+            if not rollout.teaches(name):
+                continue
             advantages[name], targets = self._advantages(name, rollout)
             logged[f"value_loss/{name}"] = self._learn_values(name, rollout, targets)
-        learners = list(self._spaces)
         order = range(len(learners))
         if self._definition.sequential and len(learners) > 1:
             order = torch.randperm(len(learners), generator=self._generators["order"]).tolist()
         weight: Tensor | None = None
         for i in order:
             name = learners[i]
-            advantage = advantages[TEAM if TEAM in advantages else name]
-            logged |= self._learn_policy(name, rollout, advantage, weight)
+            count = self._spaces[name].count
+            if TEAM in advantages:
+                weighted = advantages[TEAM].repeat_interleave(count)
+            else:
+                weighted = advantages[name]
+            if weight is not None:
+                weighted = weighted * weight.repeat_interleave(count)
+            logged |= self._learn_policy(name, rollout, weighted)
             if self._definition.sequential and len(learners) > 1:
                 ratio = self._ratio(name, rollout)
                 weight = ratio if weight is None else weight * ratio
         return logged
 
     def _advantages(self, critic: str, rollout: _Rollout) -> tuple[Tensor, Tensor]:
-        """Return normalised advantages and normalised target returns, (T * B,) each.
+        """Return normalised advantages and normalised target returns, (T * R,) each.
 
         At the end of a truncated episode, the critic's value of the final situation stands for the
         later rewards. Rewards of the next episode are not included.
@@ -252,10 +285,11 @@ class OnPolicy:
             discount=s.discount,
             gae_lambda=s.gae_lambda,
         )
-        targets = (advantages + values).flatten()
-        self._rescale(of, targets)
+        targets, acting = (advantages + values).flatten(), rollout.acting(critic)
+        self._rescale(of, _rows(targets, acting))
         flat = advantages.flatten()
-        normal = (flat - flat.mean()) / (flat.std() + 1e-8)
+        counted = _rows(flat, acting)
+        normal = (flat - counted.mean()) / (counted.std() + 1e-8)
         return normal, (targets - of.returns.mean.float()) / of.returns.std
 
     def _rescale(self, critic: _Critic, targets: Tensor) -> None:
@@ -274,8 +308,9 @@ class OnPolicy:
 
     def _learn_values(self, name: str, rollout: _Rollout, targets: Tensor) -> float:
         """Fit a critic to target returns, and return the mean loss."""
-        critic = self._critics[name]
-        inputs = critic.inputs.normalise(self._critic_inputs(name, rollout)[0].flatten(0, 1))
+        critic, acting = self._critics[name], rollout.acting(name)
+        inputs = _rows(self._critic_inputs(name, rollout)[0].flatten(0, 1), acting)
+        inputs, targets = critic.inputs.normalise(inputs), _rows(targets, acting)
         total = 0.0
         batches = self._batches(len(targets))
         for batch in batches:
@@ -285,15 +320,14 @@ class OnPolicy:
             total += float(loss.detach())
         return total / len(batches)
 
-    def _learn_policy(
-        self, name: str, rollout: _Rollout, advantages: Tensor, weight: Tensor | None
-    ) -> dict[str, float]:
-        """Update a policy, and return the mean loss and entropy."""
-        actor, adam = self._actors[name], self._adams[name]
-        inputs = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
-        actions = rollout.actions[name].flatten(0, 1)
-        old_log_p = rollout.log_p[name].flatten()
-        weighted = advantages if weight is None else advantages * weight
+    def _learn_policy(self, name: str, rollout: _Rollout, weighted: Tensor) -> dict[str, float]:
+        """Update a policy by the weighted advantages, and return the mean loss and entropy."""
+        actor, adam, acting = self._actors[name], self._adams[name], rollout.acting(name)
+        observations = _rows(rollout.observations[name].flatten(0, 1), acting)
+        inputs = self._moments[name].normalise(observations)
+        actions = _rows(rollout.actions[name].flatten(0, 1), acting)
+        old_log_p = _rows(rollout.log_p[name].flatten(), acting)
+        weighted = _rows(weighted, acting)
         clip = self._settings.clip if self._definition.clips else None
         totals = torch.zeros(2)
         batches = self._batches(len(actions))
@@ -308,23 +342,33 @@ class OnPolicy:
         return {f"policy_loss/{name}": loss_mean, f"entropy/{name}": entropy_mean}
 
     def _ratio(self, name: str, rollout: _Rollout) -> Tensor:
-        """Return the ratio of each action's new to old probability, (T * B,)."""
+        """Return the ratio of the new to the old probability of the learner's actions, (T * B,)."""
         inputs = self._moments[name].normalise(rollout.observations[name].flatten(0, 1))
         with torch.no_grad():
             log_p, _ = self._actors[name].evaluate(inputs, rollout.actions[name].flatten(0, 1))
-        return (log_p - rollout.log_p[name].flatten()).exp()
+        ratio = (log_p - rollout.log_p[name].flatten()).exp()
+        mask, count = rollout.masks.get(name), self._spaces[name].count
+        if mask is not None:
+            ratio = torch.where(mask.flatten(), ratio, 1.0)
+        return ratio if count == 1 else ratio.view(-1, count).prod(1)
 
     def _critic_inputs(self, critic: str, rollout: _Rollout) -> tuple[Tensor, Tensor]:
-        """Return the inputs of a critic before and after each decision, (T, B, n) each."""
+        """Return the inputs of a critic before and after each decision, (T, R, n) each."""
         if self._definition.critic == "state":
-            return rollout.state, rollout.next_state
+            state, next_state = rollout.state, rollout.next_state
+            return self._of_rows(critic, state), self._of_rows(critic, next_state)
         return rollout.observations[critic], rollout.next_observations[critic]
 
     def _rewards_of(self, critic: str, rollout: _Rollout) -> Tensor:
-        """Return the rewards that a critic learns, (T, B)."""
+        """Return the rewards that a critic learns, (T, R)."""
         if self._definition.reward == TEAM:
-            return rollout.team
+            return self._of_rows(critic, rollout.team)
         return rollout.rewards[critic]
+
+    def _of_rows(self, critic: str, of_environments: Tensor) -> Tensor:
+        """Repeat values of environments, (T, B, ...), for each row of a critic, (T, R, ...)."""
+        count = 1 if critic == TEAM else self._spaces[critic].count
+        return of_environments if count == 1 else of_environments.repeat_interleave(count, dim=1)
 
     def _batches(self, rows: int) -> list[Tensor]:
         """Return the row indices of each mini-batch, over all passes."""
@@ -420,6 +464,11 @@ def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor
 def value_loss(values: Tensor, targets: Tensor) -> Tensor:
     """Return half the mean squared error of n values, shape ()."""
     return 0.5 * (values - targets).square().mean()
+
+
+def _rows(values: Tensor, chosen: Tensor | None) -> Tensor:
+    """Return the chosen rows of a tensor; all rows if ``chosen`` is None."""
+    return values if chosen is None else values.index_select(0, chosen)
 
 
 def _stacked(values: Sequence[Any]) -> Any:

@@ -4,7 +4,8 @@ A policy is a single file, ``policy.safetensors``, which holds the networks as a
 else as JSON in its header. ``policy.json`` is a readable copy of the header.
 
 In shapes, B is the number of environments or data centers, n the number of entries of an
-observation, and k the number of actions.
+observation, and k the number of actions. Arrays of a group with an agent for each of up to W CRAC
+units have the units as second axis.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pydantic import Field, ValidationError
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.config import explain
 from sdc_taichi.config.fields import Section
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, group_of
 from sdc_taichi.envs.features import entries_of_new_features
 from sdc_taichi.errors import SdcError, shortened
 from sdc_taichi.kernels.compiler import runtime
@@ -62,7 +64,7 @@ _HEADER_KEY = "policy"
 
 @dataclass(frozen=True)
 class PolicyNetwork:
-    """Perceptron that acts for one agent or for several agents together.
+    """Perceptron that acts for one agent, for each agent of a group, or for several together.
 
     For several agents, the input concatenates their observations, with each shared feature once,
     and the output concatenates their actions.
@@ -72,7 +74,8 @@ class PolicyNetwork:
     """
 
     agents: tuple[str, ...]
-    """Agents that the network acts for, in the order of their actions."""
+    """Agents that the network acts for, in the order of their actions; the name of a group stands
+    for each of its agents."""
     mean: F32
     """Mean of each entry of the observation, subtracted for normalisation, (n,)."""
     std: F32
@@ -261,11 +264,23 @@ class Policy:
     def __post_init__(self) -> None:
         """Check that the networks fit the interface."""
         served = [agent for network in self.networks for agent in network.agents]
-        if sorted(served) != sorted(self.interface.agents):
+        # The networks limit the memory that the number of units, also in a header, takes.
+        units = self.interface.crac_units or 0
+        if self.interface.own_policies and units > len(served):
+            raise SdcError(f"policy: networks of {len(served)} agents; valid is {units} or more")
+        needed = [a for group in self.interface.agents for a in self.interface.policies_of(group)]
+        if sorted(served) != sorted(needed):
             raise SdcError(
                 f"policy: networks of {', '.join(served)}; valid is one for each of "
-                f"{', '.join(self.interface.agents)}"
+                f"{', '.join(needed)}"
             )
+        for network in self.networks:
+            shared = [a for a in network.agents if self.is_shared(a)]
+            if shared and len(network.agents) > 1:
+                raise SdcError(
+                    f"policy: network of {', '.join(network.agents)}; valid is {shared[0]} alone, "
+                    "or own_policies"
+                )
         for network in self.networks:
             # The weights limit the memory that the sizes of features, numbers in a header, take.
             width = max(map(self.interface.width, network.agents))
@@ -289,10 +304,13 @@ class Policy:
                 )
 
     def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
-        """Return the actions of each agent, (B, k), for the observations of each agent, (B, n)."""
+        """Return the actions of each group, (B, k), for the observations of each group, (B, n).
+
+        Those of groups with an agent for each CRAC unit are (B, W, k) and (B, W, n).
+        """
         by_agent: dict[str, F32 | I64] = {}
         for network, entries in zip(self.networks, self.entries, strict=True):
-            parts = [observations[agent][:, columns] for agent, columns in entries.items()]
+            parts = [self._seen(agent, observations)[:, e] for agent, e in entries.items()]
             actions = network.actions(parts[0] if len(parts) == 1 else np.concatenate(parts, 1))
             if network.head == "argmax" and self.interface.actions == "continuous":
                 actions = action_levels(network.choices)[np.asarray(actions, dtype=np.int64)]
@@ -301,14 +319,33 @@ class Policy:
                 end = first + self.interface.action_width(agent)
                 by_agent[agent] = actions[:, first:end]
                 first = end
-        return {agent: by_agent[agent] for agent in self.interface.agents}
+        by_group: dict[str, F32 | I64] = {}
+        for group in self.interface.agents:
+            if group in self.interface.own_policies:
+                each: list[Any] = [by_agent[agent] for agent in self.interface.policies_of(group)]
+                by_group[group] = np.stack(each, axis=1)
+            else:
+                shape = observations[group].shape[:-1]
+                by_group[group] = by_agent[group].reshape(*shape, -1)
+        return by_group
+
+    def _seen(self, agent: str, observations: Mapping[str, F32]) -> F32:
+        """Return the observations of an agent, or of each agent of a group, in rows, (rows, n)."""
+        of_group = observations[group_of(agent)]
+        if agent in self.interface.agents:
+            return of_group.reshape(-1, of_group.shape[-1])
+        return of_group[:, int(agent.rpartition("_")[2])]
+
+    def is_shared(self, agent: str) -> bool:
+        """Return True if a name stands for each agent of a group of CRAC units."""
+        return agent in self.interface.agents and AGENT_DEFINITIONS[agent].per_unit
 
     @cached_property
     def entries(self) -> tuple[dict[str, npt.NDArray[np.int64] | slice], ...]:
         """Entries of each agent's observation that each network concatenates as its input."""
         features = self.interface.features
         return tuple(
-            entries_of_new_features({agent: features[agent] for agent in network.agents})
+            entries_of_new_features({agent: features[group_of(agent)] for agent in network.agents})
             for network in self.networks
         )
 

@@ -156,8 +156,9 @@ class _Run:
         self._settings, self._folder = settings, folder
         self._env = env = make_env(settings)
         try:
-            self._interface = interface_of(env.core.sim.fleet, env.core.options)
             self._stream = make_stream(settings, env)
+            own_policies = self._stream.own_policies
+            self._interface = interface_of(env.core.sim.fleet, env.core.options, own_policies)
             learning, episode_steps = settings.learning, self._stream.episode_steps
             self._steps_each = env.num_envs * learning.steps_per_update(episode_steps)
             self._updates = settings.steps // self._steps_each
@@ -464,6 +465,7 @@ def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> Environ
     return EnvironmentStream(
         env,
         joint=settings.algorithm == "ppo" and len(env.possible_agents) > 1,
+        own_policies=settings.own_policies,
         decision_steps=learning.decision_steps,
         levels=learning.levels,
         shares_state=uses_state(settings.algorithm, settings.learning),

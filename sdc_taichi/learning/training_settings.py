@@ -31,7 +31,8 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.fields import Section
 from sdc_taichi.control.registry import is_path
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, HALL_AGENTS, Agent
+from sdc_taichi.envs.hall import LARGEST_CHANGES
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.learning.algorithms import LEARNING_SETTINGS, LearningSettings
@@ -78,6 +79,9 @@ class A1, and failures and heat waves ten times as frequent as in practice, so t
 in a few weeks."""
 _COOL = {"agent_dc": {"cooling_carbon": 10.0, "hot_inlets": 1.0}}
 """Default rewards with ten times the weight of hot server inlets."""
+HALL_OBJECTIVE = "energy+140*heat"
+"""Objective of halls: the energy, and for each hour and kelvin by which the hottest inlet exceeds
+27 C as much as the rewards of the agents weigh it in ``hall_agents_6``."""
 SCENARIOS: Mapping[str, Mapping[str, Any]] = {
     "carbon": {"sites": SITES},
     "carbon-rich": {"sites": SITES, "overrides": _FLEXIBLE},
@@ -94,11 +98,19 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
         "environment": {"rewards": _COOL, "collaboration": 1.0},
         "validation": {"optimum": False},
     },
+    "hall": {
+        "config": "hall_agents_6",
+        "weeks": None,
+        "data_centers": 32,
+        "environment": {"agents": HALL_AGENTS, "days": 1},
+        "validation": {"optimum": False, "weeks": (1, 25), "days": 2, "objective": HALL_OBJECTIVE},
+    },
 }
-"""Training settings of each scenario. All scenarios use preset ``corrected``: ``carbon`` minimises
-carbon emissions, ``bill`` the electricity bill (time-of-use energy prices and a demand charge).
-Scenarios ``-rich`` have more deferrable work and a larger battery. ``failures`` minimises carbon
-emissions with failing cooling equipment and a penalty for hot server inlets."""
+"""Training settings of each scenario. Scenarios with ``sites`` use preset ``corrected``: ``carbon``
+minimises carbon emissions, ``bill`` the electricity bill (time-of-use energy prices and a demand
+charge). Scenarios ``-rich`` have more deferrable work and a larger battery. ``failures`` minimises
+carbon emissions with failing cooling equipment and a penalty for hot server inlets. ``hall`` has an
+agent for each CRAC unit of a hall and one for the plant, which minimise energy and hot inlets."""
 
 CI_LEADS_H = tuple(range(1, 25))
 """Lead times of the carbon-intensity and price forecasts that agents observe, in h."""
@@ -124,18 +136,24 @@ def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     agents, commands = options.get("agents") or AGENTS, options.get("commands") or {}
     # Ignore invalid values here; they are reported when all options are validated.
-    agents = [x for x in agents if x in AGENTS] if isinstance(agents, list | tuple) else []
+    learning = agents if isinstance(agents, list | tuple) else []
+    agents = [x for x in learning if x in AGENTS]
     commands = commands if isinstance(commands, Mapping) else {}
     defaults: dict[str, Any] = {}
     if options.get("actions", "continuous") == "continuous":
         defaults["actions"] = "continuous"
-        decided = commands.get("agent_dc", ("cooling",))
-        moves_setpoint = isinstance(decided, list | tuple) and "cooling" in decided
-        if "agent_dc" in agents and moves_setpoint:
-            defaults["setpoint_change_k"] = SETPOINT_CHANGE_K
+        for agent in ("agent_dc", *HALL_AGENTS):
+            decided = commands.get(agent, (AGENT_DEFINITIONS[agent].command,))
+            if agent not in learning or not isinstance(decided, list | tuple):
+                continue
+            if "cooling" in decided:
+                defaults["setpoint_change_k"] = SETPOINT_CHANGE_K
+            if "fan" in decided and agent in HALL_AGENTS:
+                name, largest = LARGEST_CHANGES["fan"]
+                defaults[name] = largest
     if options.get("rewards", "default") in _OWN_PARTS:
         defaults["collaboration"] = 1.0
-    if options.get("observations", "default") == "default":
+    if agents and options.get("observations", "default") == "default":
         defaults["ci_leads_h"] = CI_LEADS_H
         if not commands:
             defaults["features"] = {agent: _features(agent, options) for agent in agents}
@@ -173,8 +191,8 @@ class ValidationSettings(Section):
     days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
     """Number of days simulated in each week, 2..7; the first day is not scored."""
     objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
-    """Objective by which policies are compared: ``carbon``, ``energy``, ``cost``, ``water``, or a
-    sum such as ``carbon+0.002*water``."""
+    """Objective by which policies are compared: ``carbon``, ``energy``, ``cost``, ``water``,
+    without an optimum ``heat``, or a sum such as ``carbon+0.002*water``."""
     optimum: bool = True
     """True to compute the optimum of the validation weeks once. It gives the share of the
     achievable saving, and the value of stored energy and waiting work at the end of a week. False
@@ -194,7 +212,7 @@ class TrainingSettings(Section):
     ``hasac`` or ``cross-entropy``."""
     scenario: str | None = None
     """Scenario that provides default settings: ``carbon``, ``carbon-rich``, ``bill``,
-    ``bill-rich`` or ``failures``; None selects no scenario."""
+    ``bill-rich``, ``failures`` or ``hall``; None selects no scenario."""
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] = "corrected"
     """Configuration of the data center: a preset, a file, or the sections of a configuration."""
     overrides: dict[str, Any] = Field(default={})
@@ -217,6 +235,9 @@ class TrainingSettings(Section):
     complete updates as fit."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
     """Seed of networks, actions, mini-batches and episodes, 0..2^31 - 1."""
+    own_policies: tuple[Agent, ...] = ()
+    """Groups of which each agent learns a policy of its own. By default all agents of a group share
+    a policy, which then also controls halls with other numbers of CRAC units."""
     learning: SerializeAsAny[LearningSettings] = Field(default={}, validate_default=True)
     """Settings of the algorithm."""
     checkpoint_steps: Steps = 100_000
@@ -299,6 +320,18 @@ class TrainingSettings(Section):
                 )
         return value
 
+    @field_validator("own_policies")
+    @classmethod
+    def _of_units(cls, value: tuple[str, ...], info: Any) -> tuple[str, ...]:
+        """Refuse groups with a single agent, and algorithms with a single network."""
+        environment = info.data.get("environment", EnvOptions())
+        valid = [a for a in environment.agents if AGENT_DEFINITIONS[a].per_unit]
+        if not set(value) <= set(valid):
+            raise ValueError(f"{list(value)}; valid are groups of CRAC units that learn: {valid}")
+        if value and info.data.get("algorithm") == "ppo":
+            raise ValueError("without effect with ppo, which has one network; valid with others")
+        return tuple(dict.fromkeys(value))
+
     @field_serializer("environment")
     def _options_set(self, value: EnvOptions) -> dict[str, Any]:
         """Return the options that were set explicitly and differ from the defaults of trainings."""
@@ -324,7 +357,9 @@ class TrainingSettings(Section):
 
     def to_yaml(self) -> str:
         """Return the settings as YAML text, from which ``load_settings`` reads equal settings."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        # Fingerprints of trainings before this setting do not contain it.
+        unset = None if self.own_policies else {"own_policies"}
+        return yaml.safe_dump(self.model_dump(mode="json", exclude=unset), sort_keys=False)
 
     def options(self) -> EnvOptions:
         """Return the options of the environments; if ``weeks`` is set, first days are fixed."""
@@ -340,12 +375,14 @@ class TrainingSettings(Section):
         return with_values(config_from_dict(self.config), overrides)
 
     def data_centers_of_weeks(self) -> list[DataCenterConfig]:
-        """Return the data centers of the training: one for each site and week, site by site.
+        """Return the data centers or fleets of the training: one for each site and week, in order.
 
         Raises:
             ConfigError: a file, value or site is not valid.
         """
         configs = self.data_centers_of_sites()
+        if configs[0].fleet is not None:
+            configs = [self._config()]
         if self.weeks is None:
             return configs
         return data_center_weeks(configs, TRAINING if self.weeks == "training" else self.weeks)

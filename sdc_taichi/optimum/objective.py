@@ -8,13 +8,20 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 
-_UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
+_UNITS = {
+    "carbon": "kg CO2e",
+    "energy": "kWh",
+    "cost": "currency of the tariff",
+    "water": "L",
+    "heat": "K h",
+}
 """Units of the objectives that consist of a single term with weight 1."""
 WEIGHT_LIMITS = (1e-100, 1e100)
 """Limits of weights above 0, within which figures neither overflow nor lose digits."""
@@ -26,7 +33,8 @@ class Objective:
     """Weights of the terms of an objective, each at least 0.
 
     The figure of a run is the value of its objective: the weighted sum of the emissions in kg CO2e,
-    the energy bought in kWh, the electricity bill, and the make-up water in litres.
+    the energy bought in kWh, the electricity bill, the make-up water in litres, and the heat of the
+    hottest inlet in K h.
 
     Raises:
         ConfigError: a weight is neither 0 nor within 1e-100..1e100, or no weight is above 0.
@@ -40,6 +48,9 @@ class Objective:
     """Weight of a currency unit of the electricity bill, which adds energy and demand charges."""
     water: float = 0.0
     """Weight of a litre of make-up water."""
+    heat: float = 0.0
+    """Weight of an hour in which the hottest server inlet is 1 K above the recommended 27 C; plans
+    do not support it."""
 
     def __post_init__(self) -> None:
         """Check the weights."""
@@ -111,7 +122,7 @@ class Objective:
         """Return the weight of a kW of the month's highest power, (B,)."""
         return np.asarray(self.cost * fleet.values("tariff.demand_charge_per_kw"))
 
-    def figure(self, *, cfp_kg: F64, grid_kwh: F64, cost: F64, water_l: F64) -> F64:
+    def figure(self, *, cfp_kg: F64, grid_kwh: F64, cost: F64, water_l: F64, heat_kh: F64) -> F64:
         """Return the figure of a run of B data centers, (B,).
 
         Args:
@@ -119,10 +130,12 @@ class Objective:
             grid_kwh: Energy bought, in kWh, (B,).
             cost: Bill of energy and demand, in the currency of the tariff, (B,).
             water_l: Make-up water, in l, (B,).
+            heat_kh: Excess of the hottest inlet over 27 C, summed over time, in K h, (B,).
         """
-        return (
+        without_heat = (
             self.carbon * cfp_kg + self.energy * grid_kwh + self.cost * cost + self.water * water_l
         )
+        return without_heat + self.heat * heat_kh if self.heat else without_heat
 
 
 def _shortest(weight: float) -> str:
@@ -146,6 +159,7 @@ class Score:
         self._demand = no_demand(start + scored_from, fleet.steps_per_hour)
         names = ("carbon_g", "grid_kwh", "energy_cost", "water_l", "dropped_tasks", "unmet_w")
         self._sums = {name: np.zeros(sim.size) for name in names}
+        self._heat_kh = np.zeros(sim.size)
         self._steps = 0
         self.start_kwh, self.start_tasks = _memory(sim)
         """Stored energy in kWh, and waiting work in tasks, at the first scored step, (B,) each."""
@@ -169,6 +183,8 @@ class Score:
             total += getattr(result, name)
         np.maximum(self.most_overdue_tasks, result.overdue_tasks, out=self.most_overdue_tasks)
         np.maximum(self.hottest_inlet_c, result.inlet_max_c, out=self.hottest_inlet_c)
+        excess_k = np.maximum(result.inlet_max_c - RECOMMENDED_C[1], 0.0)
+        self._heat_kh += excess_k * self._step_h
 
     @property
     def figure(self) -> F64:
@@ -179,6 +195,7 @@ class Score:
             grid_kwh=self._sums["grid_kwh"],
             cost=self._sums["energy_cost"] + kw_months * self._charge_per_kw,
             water_l=self._sums["water_l"],
+            heat_kh=self._heat_kh,
         )
 
     @property

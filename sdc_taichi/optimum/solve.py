@@ -164,6 +164,11 @@ def solve(
         precision=precision,
         uncoordinated=uncoordinated and len(checked_agents(agents)) > 1,
     )
+    if task.objective.heat:
+        raise ConfigError(
+            f"objective {task.objective}: heat is not planned; valid for optima are carbon, "
+            "energy, cost, water, and sums of them"
+        )
     used_cache = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
     return _optimum(task, work.entries(task, used_cache), used_cache)
