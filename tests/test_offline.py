@@ -21,6 +21,7 @@ from sdc_taichi.benchmark.offline import write_data_set  # noqa: E402
 from sdc_taichi.cli.app import app  # noqa: E402
 from sdc_taichi.errors import SdcError  # noqa: E402
 from sdc_taichi.optimum import StoppedError  # noqa: E402
+from small_halls import hall  # noqa: E402
 
 DOCS = Path(__file__).parent.parent / "docs"
 ID = "sdc_taichi/tiny-ca-v0"
@@ -111,6 +112,14 @@ def test_what_is_not_whole_leaves_nothing(tmp_path: Path, monkeypatch: Any) -> N
     metadata = minari.MinariDataset(tmp_path / "tiny-v0" / "data").storage.metadata
     assert metadata["total_episodes"] == 1
     assert "ref_max_score" not in metadata
+
+
+def test_agents_of_crac_units_act_side_by_side(tmp_path: Path) -> None:
+    options = {"agents": ["crac", "plant"]}
+    made = Collection(hall(2), ("random",), (0,), days=1, environment=options)
+    card = (write_data_set(made, tmp_path, "hall-v0").folder / "README.md").read_text()
+    for row in (r"| 0 | crac\_0 | fan |", r"| 1 | crac\_1 | fan |", "| 2 | plant | cooling |"):
+        assert row in card
 
 
 def test_what_cannot_be_written_is_one_error(tmp_path: Path, monkeypatch: Any) -> None:

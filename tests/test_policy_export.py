@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 
 from policies import interface, network, policy
+from sdc_taichi import build_fleet
+from sdc_taichi.envs.options import make_options
+from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.learning.policy import About, Policy
 from sdc_taichi.types import F32
+from small_halls import hall
 
 runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: make test-train")
 pytest.importorskip("onnx", reason="onnx is not installed: make test-train")
@@ -86,3 +90,22 @@ def test_the_model_tells_what_it_fits(tmp_path: Path) -> None:
     assert json.loads(texts["interface"]) == made.interface.model_dump(mode="json")
     assert json.loads(texts["about"])["seed"] == 4
     assert json.loads(texts["decision_steps"]) == 4
+
+
+def test_a_group_that_shares_a_policy_is_one_input_with_a_row_for_each_agent(
+    tmp_path: Path,
+) -> None:
+    from sdc_taichi.learning.export import export_onnx
+
+    options = make_options(agents=("crac", "plant"), actions="continuous")
+    made = policy(interface_of(build_fleet(hall(3)), options), seed=2, levels=5)
+    path = tmp_path / "policy.onnx"
+    export_onnx(made, path)
+    rng = np.random.default_rng(2)
+    of_units = rng.uniform(size=(2, 7, made.interface.width("crac"))).astype(np.float32)
+    of_plant = rng.uniform(size=(2, made.interface.width("plant"))).astype(np.float32)
+    found = outputs(path, {"crac": of_units.reshape(14, -1), "plant": of_plant})
+    actions = made.actions({"crac": of_units, "plant": of_plant})
+    assert actions["crac"].shape == (2, 7, 1)
+    assert np.array_equal(found["crac_action"], actions["crac"].reshape(14, 1))
+    assert np.array_equal(found["plant_action"], actions["plant"])

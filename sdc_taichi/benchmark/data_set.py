@@ -220,10 +220,11 @@ def _observations(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
 def _actions(env: SdcVectorEnv) -> Iterator[tuple[str, ...]]:
     """Yield a table row for each agent: its entries of the action, and its commands."""
     first = 0
-    for agent in env.core.agents:
-        size = int(np.prod(env.core.action_spaces[agent].shape or ()))
-        yield _entries(first, size), agent, ", ".join(env.core.options.commands_of(agent))
-        first += size
+    for group, names in env.core.members.items():
+        size = int(np.prod(env.core.action_spaces[group].shape or ()))
+        for agent in names:
+            yield _entries(first, size), agent, ", ".join(env.core.options.commands_of(group))
+            first += size
 
 
 def _entries(first: int, size: int) -> str:

@@ -109,8 +109,9 @@ class Collection:
         """Return the options of the environment; the defaults are those of trainings."""
         agents = {} if self.agent is None else {"agents": (self.agent,)}
         beneath = training_environment({**self.environment, **agents})
-        # Trainings use small setpoint changes per step, but some controllers make large ones.
-        beneath.pop("setpoint_change_k", None)
+        # Trainings use small changes per step, but some controllers make large ones.
+        for name in ("setpoint_change_k", "fan_change"):
+            beneath.pop(name, None)
         return {**beneath, **self.environment, **agents, "days": self.days}
 
     @property

@@ -49,7 +49,9 @@ def export_policy(
     check_out_file(out, ".onnx", force=force)
     policy = Policy.load(folder)
     export_onnx(policy, out)
-    print(f"{printable(out)}: inputs {', '.join(policy.interface.agents)}")
+    fits = policy.interface
+    inputs = [agent for group in fits.agents for agent in fits.policies_of(group)]
+    print(f"{printable(out)}: inputs {', '.join(inputs)}")
 
 
 def _origin(policy: Policy) -> str:
