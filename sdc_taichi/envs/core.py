@@ -267,10 +267,11 @@ class Core:
         self.sim.close()
         self._view = self._view_after = None
         self._build(configs)
-        if self._decoder.spaces != self.action_spaces:
+        members = {agent: self._names_of(agent) for agent in self.agents}
+        if self._decoder.spaces != self.action_spaces or members != self.members:
             raise ConfigError(
-                "config: draws data centers with other actions; valid are equal numbers of CRAC "
-                "units and racks where agents decide on them"
+                "config: draws data centers with other agents or actions; valid are equal numbers "
+                "of CRAC units and racks where agents decide on them, or most_units of the function"
             )
         self._config_keys = keys
 
