@@ -360,7 +360,6 @@ def test_every_episode_has_halls_of_its_own() -> None:
     assert all(np.array_equal(continued[group], expected[group]) for group in expected)
     env = HALL_ENV(lambda rng: hall(int(rng.integers(2, 5))))
     with closing(env), pytest.raises(ConfigError, match="most_units"):
-        for seed in range(9):
-            env.reset(seed=seed)
+        any(env.reset(seed=seed) is None for seed in range(9))
     with closing(HALL_ENV(HALL, 3)) as env, pytest.raises(SdcError, match="another fleet"):
         env.load_state_dict(state)

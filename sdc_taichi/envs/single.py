@@ -12,7 +12,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.envs.actions import checked_array
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.envs.base import (
     METADATA,
     HasSpec,
@@ -148,9 +147,9 @@ the environment."""
 def make_learner(core: Core, agent: str | None) -> Learner:
     """Create the learner for one agent, or for all learning agents if ``agent`` is None.
 
-    The agents of CRAC units have one learner together.
+    The agents of CRAC units, and those of the sites of a fleet, have one learner together.
     """
-    several = agent is None or AGENT_DEFINITIONS[agent].per_unit
+    several = agent is None or core.members[agent] != (agent,)
     return JointLearner(core) if several else AgentLearner(core)
 
 
