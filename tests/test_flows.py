@@ -20,9 +20,12 @@ from sdc_taichi import (
 from sdc_taichi.control.registry import make_controller
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.flows_file import FLOWS_FILE
-from sdc_taichi.run.folder_reader import read_flows, read_run
+from sdc_taichi.run.folder_reader import read_flows, read_run, read_steps
 from sdc_taichi.sim.transfer import task_kwh
 from sdc_taichi.types import StepResult
+from sdc_taichi.viz.flow_figures import FlowPanel, flow_map
+from sdc_taichi.viz.report import report_html
+from sdc_taichi.viz.report_flows import flow_panels
 
 SITES = ["AZ", "CA", "NY", "WA"]
 HOURS = 30
@@ -90,3 +93,58 @@ def test_only_fleets_have_flows(folder: Path, tmp_path: Path) -> None:
     (tmp_path / FLOWS_FILE).write_bytes(written)
     with pytest.raises(SdcError, match=r"flows.parquet: of another run than metrics.json"):
         read_flows(read_run(tmp_path))
+
+
+def test_maps_show_the_mean_day(folder: Path) -> None:
+    """Hours 0 to 5 of the day occur twice in a run of 30 h, the others once."""
+    run = read_run(folder)
+    flows = read_flows(run)
+    assert flows is not None
+    panels = flow_panels(run, flows)
+    rows = flows.table[flows.table["sender"] < 4]
+    twice = rows["hour"] % 24 < 6
+    assert panels[0].tasks.sum() == pytest.approx(rows.loc[twice, "tasks"].sum() / 2)
+    assert sum(panel.tasks.sum() for panel in panels[1:]) == pytest.approx(
+        rows.loc[~twice, "tasks"].sum()
+    )
+    for dc, steps in enumerate(read_steps(run, range(4))):
+        first = steps["time"].dt.tz_convert("UTC").dt.hour < 6
+        assert panels[0].executed_tasks[dc] == pytest.approx(
+            steps.loc[first, "executed_tasks"].sum() / 2
+        )
+        assert panels[0].ci_g_per_kwh[dc] == pytest.approx(steps.loc[first, "ci_g_per_kwh"].mean())
+        assert panels[1].ci_g_per_kwh[dc] == pytest.approx(steps[24:48]["ci_g_per_kwh"].mean())
+
+
+def test_names_on_maps_never_overlap() -> None:
+    """Of 40 sites in a small area the busiest have names; a map may cross the date line."""
+    rng = np.random.default_rng(3)
+    place_deg = np.stack(
+        [rng.uniform(40, 44, 40), (rng.uniform(178, 184, 40) + 180) % 360 - 180], axis=1
+    )
+    tasks = rng.uniform(0, 9, (40, 40)) * (rng.uniform(size=(40, 40)) < 0.05)
+    panel = FlowPanel("night", tasks, rng.uniform(50, 90, 40), rng.uniform(50, 600, 40))
+    figure = flow_map([panel], [f"site-{i}" for i in range(40)], place_deg)
+    axes = figure.axes[0]
+    (discs,) = axes.collections
+    assert np.ptp(discs.get_offsets()[:, 0]) < 6
+    centres = axes.transData.transform(discs.get_offsets())
+    radii = np.sqrt(discs.get_sizes()) / 2 * figure.dpi / 72
+    boxes = [np.stack([c - r, c + r]) for c, r in zip(centres, radii, strict=True)]
+    names = [text.get_window_extent().get_points() for text in axes.texts]
+    assert len(names) >= 5
+    for place, box in enumerate(names):
+        for other in (*boxes, *names[:place]):
+            assert np.any(box[0] >= other[1]) or np.any(other[0] >= box[1])
+
+
+def test_reports_of_fleets_list_the_largest_flows(folder: Path) -> None:
+    run = read_run(folder)
+    flows = read_flows(run)
+    assert flows is not None
+    page = report_html(run)
+    section = page[page.index("Work sent between sites</h2>") :]
+    pairs = flows.table.groupby(["sender", "receiver"])["tasks"].sum()
+    sender, receiver = pairs.idxmax()
+    assert section.index(f"{run.names[sender]} to {run.names[receiver]}") < section.index(">all<")
+    assert "The first of 2 fleets." in section

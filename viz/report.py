@@ -15,13 +15,14 @@ from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.run.comparison import Comparison
-from sdc_taichi.run.folder_reader import RunFolder, read_configs
+from sdc_taichi.run.folder_reader import RunFolder, read_configs, read_flows
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 from sdc_taichi.run.inlets_of_run import InletsAtStep, hottest_inlets
 from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, rack_text, state_texts
 
 from .plotting import format_number
 from .report_comparison import MAX_MAPPED_DCS, comparison_section
+from .report_flows import flows_section
 from .report_html import (
     DASH,
     MAX_ROWS,
@@ -149,6 +150,8 @@ def report_html(run: RunFolder, comparison: Comparison | None = None) -> str:
         sections["Known optimum"] = optimum_section(run, optimum, shown)
     if len(run.names) > 1 and run.metrics["steps_done"] > 1:
         sections["All data centers"] = fleet_section(run)
+    if (flows := read_flows(run)) is not None:
+        sections["Work sent between sites"] = flows_section(run, flows)
     for dc in shown:
         heading = f"Data center {run.names[dc.index]}{of}"
         sections[heading] = data_center_section(

@@ -1,4 +1,4 @@
-"""Pictures of the documentation: a hall, a week, a year, and controllers compared.
+"""Pictures of the documentation: a hall, a week, a year, a fleet, and controllers compared.
 
     python docs/make/pictures.py docs/img
 
@@ -25,10 +25,11 @@ from sdc_taichi import (
     simulate_to_folder,
 )
 from sdc_taichi.hall.air_metrics import allowable_c
-from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
-from sdc_taichi.viz import dashboards, figures, fleet_figures, rack_maps
+from sdc_taichi.run.folder_reader import read_flows, read_racks, read_run, read_steps
+from sdc_taichi.viz import dashboards, figures, fleet_figures, flow_figures, rack_maps
 from sdc_taichi.viz.figures import clock_text, draw_hall, hall_map, overview, step_time
 from sdc_taichi.viz.plotting import DPI, drawn, format_time_axis, new_figure, webp
+from sdc_taichi.viz.report_flows import flow_panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,6 +131,18 @@ def draw_controllers(folder: Path, scratch: Path) -> None:
     save(fleet_figures.radar(totals), folder / "radar.webp")
 
 
+def draw_fleet(folder: Path, scratch: Path) -> None:
+    """Work that the sites of a fleet send to each other in a week of January."""
+    with Simulator(load_config("fleet_of_eight")) as sim:
+        controller = make_controller("geo=geo-central,load=greedy-ci", sim.fleet)
+        simulate_to_folder(sim, controller, RunRequest("geo-central", WEEK), scratch)
+    run = read_run(scratch)
+    flows = read_flows(run)
+    assert flows is not None
+    figure = flow_figures.flow_map(flow_panels(run, flows), run.names, flows.place_deg)
+    (folder / "fleet_flows.webp").write_bytes(webp(drawn(figure, 110), colours=64))
+
+
 def main(folder: Path) -> None:
     """Write the pictures."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -138,6 +151,7 @@ def main(folder: Path) -> None:
         draw_controllers(folder, Path(scratch))
         draw_year(folder, Path(scratch) / "year")
         draw_racks(folder, Path(scratch))
+        draw_fleet(folder, Path(scratch) / "fleet")
 
 
 if __name__ == "__main__":
