@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from rrd import read, scalars, verify
 from sdc_taichi import (
+    Recorder,
     SdcError,
     Simulator,
     load_config,
@@ -31,7 +35,9 @@ SITES = ["AZ", "CA", "NY", "WA"]
 HOURS = 30
 
 
-def run_fleets(folder: Path) -> dict[tuple[int, int, int], list[float]]:
+def run_fleets(
+    folder: Path, recording: Path | None = None
+) -> dict[tuple[int, int, int], list[float]]:
     """Run two fleets of four sites; return work and saving by hour, sender and receiver."""
     fleet = {"sites": SITES, "link_share_per_hour": 0.2}
     config = with_values(load_config("tiny", ["workload.flexible_share=0.4"]), {"fleet": fleet})
@@ -39,6 +45,8 @@ def run_fleets(folder: Path) -> dict[tuple[int, int, int], list[float]]:
     with Simulator(make_configs(config, count=2)) as sim:
 
         def add(result: StepResult) -> None:
+            if recorder is not None:
+                recorder.add(result)
             energy = task_kwh(sim.fleet, sim.sizing)[0]
             for fleet, sender, receiver in np.argwhere(sim.flows_tasks()):
                 tasks = sim.flows_tasks()[fleet, sender, receiver]
@@ -50,8 +58,13 @@ def run_fleets(folder: Path) -> dict[tuple[int, int, int], list[float]]:
                 entry[0] += tasks
                 entry[1] += tasks * energy * (a - b - 0.06 * (a + b) / 2)
 
+        recorder = None if recording is None else Recorder(recording, focus=["ca-1"])
+        if recorder is not None:
+            recorder.begin(sim)
         controller = make_controller("geo=geo-all-cleaner,load=greedy-ci", sim.fleet)
         simulate_to_folder(sim, controller, RunRequest("geo", 4 * HOURS), folder, on_step=add)
+        if recorder is not None:
+            recorder.close()
     return dict(sums)
 
 
@@ -59,7 +72,7 @@ def run_fleets(folder: Path) -> dict[tuple[int, int, int], list[float]]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two fleets, beside which ``sums.csv`` has its flows."""
     out = tmp_path_factory.mktemp("runs") / "fleets"
-    sums = run_fleets(out)
+    sums = run_fleets(out, out.with_name("run.rrd"))
     pd.DataFrame([(*key, *sums[key]) for key in sorted(sums)]).to_csv(out.with_name("sums.csv"))
     return out
 
@@ -95,6 +108,36 @@ def test_only_fleets_have_flows(folder: Path, tmp_path: Path) -> None:
         read_flows(read_run(tmp_path))
 
 
+def test_recordings_show_flows_of_the_fleet_in_focus(folder: Path) -> None:
+    """The data center in focus belongs to the second fleet, of data centers 4 to 7."""
+    run = read_run(folder)
+    flows = read_flows(run)
+    assert flows is not None
+    recorded = read(folder.with_name("run.rrd"))
+    for field in ("sent_tasks", "landed_tasks"):
+        lines = recorded[f"/flows/{field}"]
+        assert lines["SeriesLines:names"] == [run.names[4:]]
+        expected = np.stack([steps[field] for steps in read_steps(run, range(4, 8))], axis=1)
+        np.testing.assert_array_equal(scalars(lines), expected)
+        assert expected.any()
+    arrows = recorded["/flows/map/sent"]
+    assert arrows["step"] == [4 * hour + 3 for hour in range(HOURS)]
+    rows = flows.table[flows.table["sender"] >= 4]
+    strips = arrows["GeoLineStrings:line_strings"]
+    by_hour = [rows[rows["hour"] == hour] for hour in range(HOURS)]
+    assert [len(each) for each in strips] == [len(each) for each in by_hour]
+    assert min(map(len, strips)) < max(map(len, strips))
+    for arrow, (sender, receiver) in zip(
+        itertools.chain.from_iterable(strips),
+        rows[["sender", "receiver"]].to_numpy(),
+        strict=True,
+    ):
+        np.testing.assert_allclose(arrow[0], flows.place_deg[sender])
+        np.testing.assert_allclose(arrow[11], flows.place_deg[receiver])
+    assert recorded["/flows/map/wa-1"]["step"] == arrows["step"]
+    assert verify(folder.with_name("run.rrd")).returncode == 0
+
+
 def test_maps_show_the_mean_day(folder: Path) -> None:
     """Hours 0 to 5 of the day occur twice in a run of 30 h, the others once."""
     run = read_run(folder)
@@ -126,7 +169,7 @@ def test_names_on_maps_never_overlap() -> None:
     panel = FlowPanel("night", tasks, rng.uniform(50, 90, 40), rng.uniform(50, 600, 40))
     figure = flow_map([panel], [f"site-{i}" for i in range(40)], place_deg)
     axes = figure.axes[0]
-    (discs,) = axes.collections
+    discs: Any = axes.collections[0]
     assert np.ptp(discs.get_offsets()[:, 0]) < 6
     centres = axes.transData.transform(discs.get_offsets())
     radii = np.sqrt(discs.get_sizes()) / 2 * figure.dpi / 72
@@ -145,6 +188,7 @@ def test_reports_of_fleets_list_the_largest_flows(folder: Path) -> None:
     page = report_html(run)
     section = page[page.index("Work sent between sites</h2>") :]
     pairs = flows.table.groupby(["sender", "receiver"])["tasks"].sum()
-    sender, receiver = pairs.idxmax()
+    largest: Any = pairs.idxmax()
+    sender, receiver = largest
     assert section.index(f"{run.names[sender]} to {run.names[receiver]}") < section.index(">all<")
     assert "The first of 2 fleets." in section

@@ -99,7 +99,8 @@ def flow_map(panels: Sequence[FlowPanel], names: Sequence[str], place_deg: F64) 
         radii_pt = _LARGEST_DISC_PT * np.sqrt(panel.executed_tasks / (most_executed or 1.0))
         arrows = _draw_arrows(axes, panel.tasks / (most or 1.0), x_y, radii_pt)
         discs = axes.scatter(
-            *x_y.T,
+            x_y[:, 0],
+            x_y[:, 1],
             s=(2 * radii_pt) ** 2,
             c=panel.ci_g_per_kwh,
             norm=colours,
@@ -146,13 +147,13 @@ def _draw_arrows(axes: Axes, shares: F64, x_y: F64, radii_pt: F64) -> F64:
         x_y: places of the sites, (S, 2).
         radii_pt: radii of their discs, in points, (S,).
     """
-    points = [np.empty((0, 2))]
+    points: list[F64] = [np.empty((0, 2))]
     for sender, receiver in sorted(np.argwhere(shares), key=lambda pair: -shares[tuple(pair)]):
         ends = (radii_pt[sender], radii_pt[receiver])
         share = shares[sender, receiver]
         arrow = axes.add_patch(_arrow(x_y[sender], x_y[receiver], share, ends, _BEND))
         outline = arrow.get_path().transformed(arrow.get_transform())
-        points.append(outline.interpolated(_POINTS_OF_SIDE).vertices)
+        points.append(np.asarray(outline.interpolated(_POINTS_OF_SIDE).vertices, dtype=np.float64))
     return np.concatenate(points)
 
 
@@ -161,7 +162,7 @@ def _arrow(begin: F64, end: F64, share: float, shrink_pt: tuple[float, float], b
     from matplotlib.patches import ArrowStyle, FancyArrowPatch
 
     width_pt = max(_WIDEST_ARROW_PT * share, _NARROWEST_ARROW_PT)
-    style = ArrowStyle.Simple(  # type: ignore[attr-defined]
+    style = ArrowStyle.Simple(
         head_length=_ARROW_HEAD_PT + 0.5 * width_pt,
         head_width=_ARROW_HEAD_PT + 1.2 * width_pt,
         tail_width=width_pt,
@@ -196,7 +197,8 @@ def _draw_names(
     taken = [np.stack([c - r, c + r]) for c, r in zip(centres, radii_pt + 1.0, strict=True)]
     for site in np.argsort(-importance, kind="stable")[:MAX_LABELS]:
         text = literal_text(names[site])
-        label = axes.text(*x_y[site], text, fontsize=9, ha="center", va="center", zorder=4)
+        x, y = x_y[site].tolist()
+        label = axes.text(x, y, text, fontsize=9, ha="center", va="center", zorder=4)
         extent = label.get_window_extent().get_points() * points
         size = extent[1] - extent[0]
         middles = np.array([*_places(centres[site], radii_pt[site], size)])
@@ -209,7 +211,8 @@ def _draw_names(
             continue
         on_arrows = np.all((arrows > low[:, None]) & (arrows < high[:, None]), axis=2)
         best = int(np.where(fits, on_arrows.sum(axis=1), np.inf).argmin())
-        label.set_position(axes.transData.inverted().transform(middles[best] / points))
+        x, y = axes.transData.inverted().transform(middles[best] / points).tolist()
+        label.set_position((x, y))
         taken.append(np.stack([low[best], high[best]]))
 
 

@@ -1,6 +1,7 @@
 """Views of a recording, and its static entities: line styles, image formats, colour bars, halls.
 
-In the viewer, a recording has a tab for each data center in focus, and one for the fleet.
+In the viewer, a recording has a tab for each data center in focus, one for the fleet, and one for
+the work that sites of a fleet send to each other.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from sdc_taichi.types import F64
 
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, annotation_context, invisible_names
+from .recording_flows import ABOUT_PATH, FLOW_PLOTS, MAP_PATH, FlowPictures
 from .recording_racks import (
     DOWN_RGB,
     TRENDS,
@@ -91,16 +93,20 @@ class FocusTab(NamedTuple):
     """Number of rows and of places of each zone; empty if the recording has no zones."""
 
 
-def make_blueprint(tabs: Sequence[FocusTab], *, has_rewards: bool) -> rrb.Blueprint:
+def make_blueprint(
+    tabs: Sequence[FocusTab], *, has_rewards: bool, flows: FlowPictures | None
+) -> rrb.Blueprint:
     """Return the arrangement of the views of a recording.
 
     Args:
         tabs: tabs of the data centers in focus.
         has_rewards: True if reward terms are recorded.
+        flows: flows between the sites of a fleet; None if there are none.
     """
+    flow_tabs = [] if flows is None else [_flow_tab(flows.map_zoom)]
     focus_tabs = (_focus_tab(tab, has_rewards=has_rewards) for tab in tabs)
     return rrb.Blueprint(
-        rrb.Tabs(*focus_tabs, _fleet_tab()),
+        rrb.Tabs(*focus_tabs, _fleet_tab(), *flow_tabs),
         rrb.TimePanel(
             timeline="sim_time",
             playback_speed=PLAYBACK_S_PER_S,
@@ -124,6 +130,25 @@ def _fleet_tab() -> Any:
         rrb.Grid(*plots, grid_columns=2),
         column_shares=[2, 3],
         name="fleet",
+    )
+
+
+def _flow_tab(zoom: float | None) -> Any:
+    """Return the tab with the map of flows between sites, and the plots of what sites send.
+
+    Args:
+        zoom: zoom of the map; None if there is no map.
+    """
+    plots = [_plot_view(f"flows/{field}", title) for field, title in FLOW_PLOTS.items()]
+    if zoom is None:
+        return rrb.Vertical(*plots, name="work between sites")
+    flow_map = rrb.Vertical(
+        rrb.MapView(origin=MAP_PATH, name="work sent in the past hour", zoom=zoom),
+        rrb.TextDocumentView(origin=ABOUT_PATH, name="about the map"),
+        row_shares=[5, 1],
+    )
+    return rrb.Horizontal(
+        flow_map, rrb.Vertical(*plots), column_shares=[3, 2], name="work between sites"
     )
 
 

@@ -12,6 +12,7 @@ A recording has these entities, where NAME is the name of a data center in focus
     dc/NAME/series/..., crac/...       series, each entity with lines of one unit
     dc/NAME/actions/...                commands, as states
     dc/NAME/events                     log of events
+    flows/...                          work that sites of a fleet send to each other
     fleet/...                          sums and maxima over all data centers
     dc/NAME/legend/...                 static colour bars of the maps
     summary                            static text
@@ -43,6 +44,7 @@ from .colour_scales import ColourScale, InletRange
 from .rack_histories import RackHistory
 from .recording_airflow import AirflowPictures
 from .recording_blocks import MAX_BLOCK_BYTES, Block, BlockBuilder, choose_cadence
+from .recording_flows import FlowPictures
 from .recording_frames import Pictures
 from .recording_output import RecordingOutput
 from .recording_racks import (
@@ -162,6 +164,9 @@ class RecordingWriter:
         ]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
         self._pictures = [list(_pictures_of(sim, dc, self._cadence)) for dc in focus]
+        self._flows: FlowPictures | None = None
+        if fleet.shared_work is not None:
+            self._flows = FlowPictures(sim, names, focus[0])
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
         """Number of steps added to the recording."""
@@ -193,6 +198,8 @@ class RecordingWriter:
             active = self._builder.active_events(dc)
             for picture in pictures:
                 picture.add(result, active)
+        if self._flows is not None:
+            self._flows.add(result)
         self.steps_added += 1
         is_late = time.monotonic() - self._written_at_s > self._block_s
         if is_late or self._builder.is_full or self._picture_bytes > MAX_BLOCK_BYTES:
@@ -202,7 +209,8 @@ class RecordingWriter:
     def _picture_bytes(self) -> int:
         """Size of the pictures of the current block other than heat maps, in bytes."""
         pictures = itertools.chain.from_iterable(self._pictures)
-        return sum(picture.size_bytes for picture in pictures)
+        flows_bytes = 0 if self._flows is None else self._flows.size_bytes
+        return flows_bytes + sum(picture.size_bytes for picture in pictures)
 
     def flush(self) -> None:
         """Write the steps of the current, incomplete block, and what is known of their racks."""
@@ -233,6 +241,9 @@ class RecordingWriter:
             self._times, (block.steps, block.map_steps, block.hall_steps)
         )
         self._write_fleet(block, times[0])
+        if self._flows is not None:
+            for entity, steps, columns in self._flows.take():
+                self._output.add_columns(entity, self._times(steps)[0], columns)
         for index, dc in enumerate(self._focus):
             path, values = self._path(dc), block.values[:, :, index]
             self._write_lines(block, index, path, times[index], values)
@@ -373,7 +384,7 @@ class RecordingWriter:
                 )
             )
         rewards = self._builder.reward_names or ()
-        self._output.open(make_blueprint(tabs, has_rewards=bool(rewards)))
+        self._output.open(make_blueprint(tabs, has_rewards=bool(rewards), flows=self._flows))
         names = {dc: self._names[dc] for dc in self._focus}
         scales = dict(zip(self._focus, self._scales, strict=True))
         text = summary_markdown(
@@ -381,6 +392,8 @@ class RecordingWriter:
         )
         summary = rr.TextDocument(text, media_type="text/markdown")
         self._output.send_static([("summary", summary), *fleet_entities()])
+        if self._flows is not None:
+            self._output.send_static(self._flows.entities())
         for dc, levels in zip(self._focus, self._cadence.levels, strict=True):
             path = self._path(dc)
             self._output.send_static(

@@ -90,7 +90,8 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     for line in first_lines(sorted(sources), MOST_LINES, ", see metrics.json"):
         console.print(f"  {line}")
     config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
-    more = ", optimum/" if "optimum" in metrics else ""
+    more = ", flows.parquet" if "moved_tasks" in metrics["total"] else ""
+    more += ", optimum/" if "optimum" in metrics else ""
     console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}{more}")
 
 
