@@ -57,9 +57,8 @@ class FlowPictures:
         self._sites = slice(self._index * sites, (self._index + 1) * sites)
         self._names = list(names[self._sites])
         self._place_deg = sim.drivers.place_deg[self._sites]
-        series = [sim.drivers.ci_g_per_kwh.take([each]).values for each in range(fleet.size)]
-        of_sites = np.concatenate(series[self._sites])
-        self._ci_range = float(of_sites.min()), float(max(of_sites.max(), of_sites.min() + 1.0))
+        ci = sim.drivers.ci_g_per_kwh.take(range(fleet.size)[self._sites]).values
+        self._ci_range = float(ci.min()), float(max(ci.max(), ci.min() + 1.0))
         capacity = TASKS_PER_STEP * fleet.steps_per_hour
         limit = float(shared.link_tasks[self._sites].max()) * fleet.steps_per_hour
         flexible = float(fleet.values("workload.flexible_share")[self._sites].max())
