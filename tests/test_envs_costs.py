@@ -47,6 +47,7 @@ def test_costs_are_what_their_names_say() -> None:
         tasks = infos["overdue_tasks"] + infos["dropped_tasks"] + infos["lost_tasks"]
         expected = {
             "hot_inlets": infos["over_27_mean_k"] / 4,
+            "hottest_inlet": np.maximum(infos["inlet_max_c"] - 27.0, 0.0) / 4,
             "throttled_racks": (infos["throttled_racks"] + infos["tripped_racks"]) / 4,
             "overdue_work": tasks,
             "grid_overload": infos["grid_overload_kwh"],
@@ -120,7 +121,7 @@ def test_registered_costs() -> None:
 WRONG: list[tuple[Any, str]] = [
     ("hot_inlets", "costs 'hot_inlets': valid is None, a list of costs, or a dict"),
     ([], "costs []: valid is None, a list"),
-    (["hot_inlet"], "cost 'hot_inlet': unknown; valid: hot_inlets, throttled_racks"),
+    (["hot_inlet"], "cost 'hot_inlet': unknown; valid: hot_inlets, hottest_inlet"),
     ([None], "cost None: unknown"),
     (["hot_inlets", "hot_inlets"], "'hot_inlets' is named twice"),
     ({"hot_inlets": -1}, "hot_inlets has weight -1; valid is a number of at least 0"),

@@ -107,6 +107,8 @@ def test_a_unit_that_is_down_does_not_act() -> None:
     *_, infos = env.step(zeros(env))
     assert [infos[f"crac_{unit}"]["acts"] for unit in range(3)] == [1, 0, 1]
     assert "acts" not in infos["plant"]
+    over_k = np.maximum(env.core.view.zone_hottest_true_c - 27.0, 0.0)
+    assert [infos[f"crac_{unit}"]["zone_heat_k_h"] for unit in range(3)] == (over_k / 12).tolist()
     state = env.state_dict()
     still, *_ = env.step(zeros(env))
     env.load_state_dict(state)

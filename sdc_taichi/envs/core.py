@@ -57,6 +57,7 @@ from sdc_taichi.envs.options import ConfigDraw, EnvOptions
 from sdc_taichi.envs.recording import EpisodeRecordings, RecorderOption
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.view_terms import RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
 from sdc_taichi.sim.drivers import local_start
@@ -568,6 +569,20 @@ class Core:
             return {}
         running = self._slots.fill(self.view.unit_running) > 0
         return {a: running & self._slots.exists for a in self.agents if a in self._of_units}
+
+    def zone_heat_k_h(self) -> dict[str, F64]:
+        """Return the excess of the hottest inlet of each agent's zone over 27 C, in K h, (B, W).
+
+        It is that of the last step, by learning group with an agent for each CRAC unit, and 0
+        before the first step.
+        """
+        groups = [agent for agent in self.agents if agent in self._of_units]
+        if not groups:
+            return {}
+        view = self.view
+        over_k = np.maximum(view.zone_hottest_true_c - RECOMMENDED_C, 0.0)
+        heat = self._slots.fill(over_k * (0.0 if view.last is None else view.step_h))
+        return dict.fromkeys(groups, heat)
 
     def start_info(self) -> dict[str, npt.NDArray[Any]]:
         """Return the start day and the randomly drawn inputs of the current episodes, (E,) each.

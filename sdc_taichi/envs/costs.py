@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
+from sdc_taichi.envs.view_terms import RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
@@ -34,6 +35,11 @@ CostFunction = Callable[[StepResult, View], Any]
 def hot_inlets(result: StepResult, view: View) -> F64:
     """Excess of inlets over the recommended 27 C, mean of all servers, in K h (ASHRAE TC 9.9)."""
     return result.over_27_mean_k * result.step_h
+
+
+def hottest_inlet(result: StepResult, view: View) -> F64:
+    """Excess of the hottest inlet over the recommended 27 C, in K h."""
+    return np.maximum(result.inlet_max_c - RECOMMENDED_C, 0.0) * result.step_h
 
 
 def throttled_racks(result: StepResult, view: View) -> F64:
@@ -70,6 +76,7 @@ COSTS: dict[str, CostFunction] = {
     function.__name__: function
     for function in (
         hot_inlets,
+        hottest_inlet,
         throttled_racks,
         overdue_work,
         grid_overload,

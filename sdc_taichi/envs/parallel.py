@@ -32,9 +32,10 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 
     Episodes end by truncation, because their length is a choice and a data center has no final
     state; only a result beyond the physical limits terminates an episode. All agents have the same
-    infos, except ``acts``: ``ended_by``, ``start_day``, the randomly drawn inputs, the facility's
-    quantities of ``StepResult`` by name, and the costs of the option ``costs``. Those of
-    ``reset`` have the same keys; ``ended_by``, quantities and costs are 0 there.
+    infos, except ``acts`` and ``zone_heat_k_h``: ``ended_by``, ``start_day``, the randomly drawn
+    inputs, the facility's quantities of ``StepResult`` by name, and the costs of the option
+    ``costs``. Those of ``reset`` have the same keys; ``ended_by``, quantities and costs are 0
+    there.
 
     Args:
         config: a preset, a file or a config.
@@ -151,14 +152,18 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         return by_group | {agent: [action] for agent, action in left.items()}
 
     def _infos(self, infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return the infos of each agent, with ``acts`` for agents of CRAC units."""
-        masks = self.core.masks()
+        """Return the infos of each agent.
+
+        Agents of CRAC units have ``acts`` and ``zone_heat_k_h`` in addition.
+        """
+        masks, heat_k_h = self.core.masks(), self.core.zone_heat_k_h()
         by_agent: dict[str, dict[str, Any]] = {}
         for group, names in self._groups.items():
             for i, agent in enumerate(names):
                 by_agent[agent] = as_scalars(infos, i)
                 if group in masks:
                     by_agent[agent]["acts"] = int(masks[group][0, i])
+                    by_agent[agent]["zone_heat_k_h"] = float(heat_k_h[group][0, i])
         return by_agent
 
 
