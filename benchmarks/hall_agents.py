@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig, load_config
 from sdc_taichi.control.unit_zones import UnitZones
 from sdc_taichi.optimum.hall_search import FoundCommands, best_found, cost_w, found, one_speed
+from sdc_taichi.optimum.uncoordinated import title_of, uncoordinated
 from sdc_taichi.sim.commanded_halls import CommandedHalls, HallConditions
 from sdc_taichi.sim.drivers import load_drivers
 from sdc_taichi.sim.fleet import build_fleet
@@ -52,6 +53,8 @@ CASES: dict[str, list[tuple[str, str, tuple[int, ...]]]] = {
     "64": [("mild", ".9/.3", ()), ("hot", "1/.47", ())],
 }
 CASES["16"] = CASES["6"]
+PLANT = -1
+"""Player that chooses the setpoint; the others are units by their number."""
 SETPOINTS_C, TARGETS_C = (19.0, 20, 21, 22, 23, 24, 25), (25.0, 26, 26.5, 26.9)
 """Common setpoints and targets of the hottest inlet of a zone, in C, that local control tries."""
 SENSOR_ERROR_K, SENSOR_DRAWS = 0.5, 4
@@ -91,6 +94,8 @@ class Row:
     """Units that are down."""
     excess: dict[str, float | None]
     """Excess by rule."""
+    alone: dict[str, float | None]
+    """Excess by way of planning without coordination."""
     best: dict[str, Any]
     """Commands and results of the best found."""
     seconds: float
@@ -118,7 +123,10 @@ class Case:
         self.conditions = HallConditions(
             np.array(loads)[zone_of_rack(config)], *WEATHER_C[weather], running
         )
-        index = UnitZones(build_fleet(config)).racks(running)
+        fleet = build_fleet(config)
+        self.design_speed = float(fleet.design_speed[0])
+        self.initial_c = config.hvac.setpoint.initial_c
+        index = UnitZones(fleet).racks(running)
         self.zone_racks, self.zone_first = index.racks, index.first
 
     def follow(self, supply_c: F64) -> FoundCommands:
@@ -167,6 +175,39 @@ class Case:
             for i in range(len(setpoint_c))
         ]  # fmt: skip
 
+    def uncoordinated(self) -> dict[str, FoundCommands]:
+        """Speeds of units and setpoint of the plant that each choose for the whole hall, alone.
+
+        Each minimises the power of the facility with the penalty for inlets above the limit. Idle
+        units run at the speed of the design point, and an idle plant holds the initial setpoint.
+        """
+        halls, idle_speed, idle_c = self.halls, self.design_speed, self.initial_c
+        speeds = np.linspace(halls.min_speed, 1.0, halls.copies)
+        setpoints_c = np.linspace(*halls.setpoint_c, 37)
+
+        def commands(plans: Mapping[int, float], count: int) -> tuple[F64, F64]:
+            speed = [plans.get(unit, idle_speed) for unit in range(halls.units)]
+            supply_c = np.full((count, halls.units), plans.get(PLANT, idle_c))
+            return np.tile(speed, (count, 1)), supply_c
+
+        def best_response(player: int, plans: Mapping[int, float]) -> float:
+            choices = setpoints_c if player == PLANT else speeds
+            speed, supply_c = commands(plans, len(choices))
+            if player == PLANT:
+                supply_c[:] = choices[:, None]
+            else:
+                speed[:, player] = choices
+            states = halls.at(speed, supply_c, self.conditions)
+            return float(choices[np.argmin(cost_w(states, LIMIT_C))])
+
+        def evaluate(plans: Mapping[int, float]) -> FoundCommands:
+            speed, supply_c = commands(plans, 1)
+            return found(halls.at(speed, supply_c, self.conditions), 0, supply_c, LIMIT_C)
+
+        units = np.flatnonzero(self.conditions.running).tolist()
+        plans = {"idle": {}, **uncoordinated([*units, PLANT], best_response)}
+        return {title_of(way) if way != "idle" else way: evaluate(x) for way, x in plans.items()}
+
     def row(self, hall: str, weather: str, load: str, down: tuple[int, ...]) -> Row:
         """Compare the rules in this case."""
         begin, units = time.perf_counter(), self.halls.units
@@ -200,13 +241,8 @@ class Case:
             self.halls, self.conditions, starts, LIMIT_C,
             generations=self.effort["generations"], seed=0,
         )  # fmt: skip
-        excess = {
-            name: None
-            if max(c.inlet_max_c for c in each) > LIMIT_C + 0.05 and "sensors" not in name
-            else float(np.mean([c.facility_w - least.facility_w for c in each]))
-            / least.cooling_w * 100.0
-            for name, each in rules.items()
-        }  # fmt: skip
+        excess = {name: _excess(each, least, name) for name, each in rules.items()}
+        alone = {way: _excess([c], least) for way, c in self.uncoordinated().items()}
         best_values = {
             "facility_kw": least.facility_w / 1e3,
             "cooling_kw": least.cooling_w / 1e3,
@@ -217,7 +253,15 @@ class Case:
             "tuned_speed": tuned[best].speed.round(3).tolist(),
         }
         seconds = time.perf_counter() - begin
-        return Row(hall, weather, load, down, excess, best_values, seconds)
+        return Row(hall, weather, load, down, excess, alone, best_values, seconds)
+
+
+def _excess(each: Sequence[FoundCommands], least: FoundCommands, rule: str = "") -> float | None:
+    """Return the mean excess over the best found, in % of its cooling power; None if too warm."""
+    if max(c.inlet_max_c for c in each) > LIMIT_C + 0.05 and "sensors" not in rule:
+        return None
+    above_w = float(np.mean([c.facility_w - least.facility_w for c in each]))
+    return above_w / least.cooling_w * 100.0
 
 
 def cliff(servers: str) -> list[dict[str, float]]:
@@ -260,13 +304,13 @@ def study(halls: Sequence[str], servers: str, effort: Any) -> list[Row]:
     return rows
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return the rows as a table in Markdown."""
-    names = list(rows[0].excess)
+def table(rows: Sequence[Row], values: str = "excess") -> str:
+    """Return the rows as a table in Markdown, with the values of ``excess`` or ``alone``."""
+    names = list(getattr(rows[0], values))
     lines = ["| hall, weather, load | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for row in rows:
         down = ", one down" if row.down else ""
-        cells = ["too warm" if v is None else f"{v:.1f}" for v in row.excess.values()]
+        cells = ["too warm" if v is None else f"{v:.1f}" for v in getattr(row, values).values()]
         label = f"{row.hall}, {row.weather}, {row.load}{down}"
         lines.append("| " + " | ".join([label, *cells]) + " |")
     return "\n".join(lines)
@@ -286,7 +330,7 @@ def main() -> None:
     for servers in chosen.servers:
         rows = study(chosen.halls, servers, QUICK if chosen.quick else FULL)
         states = cliff(servers)
-        print(f"\nservers: {servers}\n\n{table(rows)}\n")
+        print(f"\nservers: {servers}\n\n{table(rows)}\n\n{table(rows, 'alone')}\n")
         for state in states:
             print(", ".join(f"{name} {value:.4g}" for name, value in state.items()))
         rows_values = [{name: getattr(row, name) for name in Row.__slots__} for row in rows]
