@@ -128,6 +128,10 @@ def test_rewards_of_units_are_parts_of_those_of_the_hall() -> None:
     with closing(HALL_ENV(HALL, 2, rewards=rewards, collaboration=0.4)) as env:
         env.reset(seed=0)
         _, mixed, *_ = env.step({"crac": speeds, "plant": np.zeros((2, 1))})
+    with closing(HALL_ENV(HALL, 2)) as env:
+        env.reset(seed=0)
+        _, team, *_ = env.step({"crac": speeds, "plant": np.zeros((2, 1))})
+    assert team["crac"] == pytest.approx(np.tile(team["plant"][:, None], 3), abs=1e-6)
     total = own["crac"].sum(axis=1) + own["plant"]
     by_hand = 0.4 * own["crac"] + 0.2 * (total[:, None] - own["crac"])
     assert mixed["crac"] == pytest.approx(by_hand, abs=1e-5)

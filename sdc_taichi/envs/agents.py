@@ -61,6 +61,7 @@ _OWN_UNIT = (
     *("unit_speed", "unit_supply", "unit_return", "unit_running"),
     *("zone_hottest", "zone_mean", "tile_pressure", "neighbours"),
 )
+_TEAM_OF_HALL = {"hall_power": 1.0, "hall_heat": 0.2}
 _HALL = ("zone_hottest_highest", "unit_speed_highest", "unit_speed_mean")
 
 AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
@@ -105,14 +106,14 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         part="cooling",
         commands=("fan", "cooling"),
         features=(*_OWN_UNIT, "chilled_water", "time_of_day"),
-        scales={"default": {"zone_power": 1.0, "zone_heat": 0.2}},
+        scales={"default": _TEAM_OF_HALL, "own": {"zone_power": 1.0, "zone_heat": 0.2}},
         per_unit=True,
     ),
     "plant": AgentDefinition(
         part="cooling",
         commands=("cooling", "chilled_water"),
         features=("outdoor", "wet_bulb", "dc_load", *_HALL, "setpoint_mean", "chilled_water"),
-        scales={"default": {"hall_power": 1.0, "hall_heat": 0.2}},
+        scales={"default": _TEAM_OF_HALL, "own": _TEAM_OF_HALL},
         also_controlled=("placement",),
     ),
 }
@@ -125,7 +126,8 @@ carbon intensity for the load and battery agents.
 Reward set ``default`` charges each agent for the part of the carbon emissions that it can change.
 Reward set ``bill`` uses prices instead of carbon intensity and adds a charge for high power. Reward
 set ``paper`` contains r_LS, r_DC and r_BAT of the paper (4.5, F.2), with carbon and energies
-divided by their values at the design point.
+divided by their values at the design point. In reward set ``own`` an agent of a CRAC unit has a
+part of the reward that all agents of a hall share in ``default``.
 """
 
 

@@ -125,8 +125,9 @@ class EnvOptions(BaseModel):
     """True if every observation is a dict of features and an image of the hall."""
     rewards: Any = "default"
     """Rewards of the agents. Valid are the reward sets ``default``, ``bill``, ``paper`` and
-    ``sustaindc``; a dict of agent to term to scale; or a function, by the object, by its registered
-    name (``register_reward``) or by its import path ``module:name``."""
+    ``sustaindc``, and for agents of a hall ``own``; a dict of agent to term to scale; or a
+    function, by the object, by its registered name (``register_reward``) or by its import path
+    ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
     """Weight a, 0..1, of an agent's individual reward in the reward that the agent receives. The
     individual rewards of the N - 1 other agents have the weight (1 - a)/(N - 1) each (paper,

@@ -44,7 +44,7 @@ for a group with an agent for each CRAC unit."""
 _COUNTED_ONCE = ("default", "bill")
 """Reward sets whose joint reward counts each term once, even if several agents have this term. The
 joint reward of all other sets is the sum of the agents' rewards."""
-SCALED_SETS = (*_COUNTED_ONCE, "paper")
+SCALED_SETS = (*_COUNTED_ONCE, "paper", "own")
 """Reward sets that are sums of terms, multiplied by the scales of ``AGENT_DEFINITIONS``."""
 REWARD_SETS = (*SCALED_SETS, "sustaindc")
 """Names of the built-in reward sets that the option ``rewards`` accepts."""
@@ -275,8 +275,13 @@ class Rewards:
         individual: dict[str, F64] = {}
         for agent in self._team:
             scales = {n: x for n, x in self._scales[agent].items() if n in terms}
-            of_view = np.zeros(fleet.units if agent in _OF_UNITS else view.size)
-            individual[agent] = of_view + _weighed(terms, scales) + by_agent.get(agent, 0.0)
+            value = np.zeros(fleet.units if agent in _OF_UNITS else view.size)
+            for name, scale in scales.items():
+                term = terms[name]
+                if agent in _OF_UNITS and name not in OF_UNITS:
+                    term = term[fleet.unit_dc]
+                value = value + scale * term
+            individual[agent] = value + by_agent.get(agent, 0.0)
         number = {a: fleet.unit_sums(np.ones(fleet.units)) for a in self._team if a in _OF_UNITS}
         sums = {a: fleet.unit_sums(x) if a in _OF_UNITS else x for a, x in individual.items()}
         total = _sum(list(sums.values()))
@@ -353,7 +358,7 @@ def _checked_scales(
             raise ConfigError(f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, team)}")
         if not isinstance(scales, Mapping):
             raise ConfigError(f"rewards of {agent}: {scales!r}; valid is a dict of term to scale")
-        valid = list(OF_UNITS if agent in _OF_UNITS else [*TERMS, *OF_DATA_CENTERS])
+        valid = [*OF_UNITS, *OF_DATA_CENTERS] if agent in _OF_UNITS else [*TERMS, *OF_DATA_CENTERS]
         for name, scale in scales.items():
             if name not in valid:
                 raise ConfigError(
