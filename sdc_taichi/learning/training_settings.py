@@ -103,6 +103,8 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
         "weeks": None,
         "data_centers": 32,
         "environment": {"agents": HALL_AGENTS, "days": 1},
+        # Air reacts within minutes, so fans need a decision in every step, and small changes.
+        "learning": {"decision_steps": 1, "levels": None},
         "validation": {"optimum": False, "weeks": (1, 25), "days": 2, "objective": HALL_OBJECTIVE},
     },
 }
