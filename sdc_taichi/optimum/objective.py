@@ -122,7 +122,15 @@ class Objective:
         """Return the weight of a kW of the month's highest power, (B,)."""
         return np.asarray(self.cost * fleet.values("tariff.demand_charge_per_kw"))
 
-    def figure(self, *, cfp_kg: F64, grid_kwh: F64, cost: F64, water_l: F64, heat_kh: F64) -> F64:
+    def figure(
+        self,
+        *,
+        cfp_kg: F64,
+        grid_kwh: F64,
+        cost: F64,
+        water_l: F64,
+        heat_kh: F64 | float = 0.0,
+    ) -> F64:
         """Return the figure of a run of B data centers, (B,).
 
         Args:
@@ -130,7 +138,7 @@ class Objective:
             grid_kwh: Energy bought, in kWh, (B,).
             cost: Bill of energy and demand, in the currency of the tariff, (B,).
             water_l: Make-up water, in l, (B,).
-            heat_kh: Excess of the hottest inlet over 27 C, summed over time, in K h, (B,).
+            heat_kh: Excess of the hottest inlet over 27 C, summed over time, in K h, (B,) or 0.
         """
         without_heat = (
             self.carbon * cfp_kg + self.energy * grid_kwh + self.cost * cost + self.water * water_l

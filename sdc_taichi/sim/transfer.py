@@ -108,17 +108,6 @@ class Transfer:
         self._size, self._shared = fleet.size, fleet.shared_work
         self._flows = None if self._shared is None else Flows(self._shared)
         self._sends = False
-        none = np.zeros(fleet.size)
-        none.flags.writeable = False
-        self._nothing = TransferResult(
-            sent_tasks=none,
-            landed_tasks=none,
-            refused_tasks=none,
-            transfer_kwh=none,
-            transfer_g=none,
-            in_flight_tasks=none,
-            in_flight=self.nothing_in_flight(),
-        )
         if self._shared is not None:
             self._flexible_share = fleet.values("workload.flexible_share")
             self._max_utilisation = fleet.values("workload.max_utilisation")
@@ -148,9 +137,9 @@ class Transfer:
             max_utilisation: Maximum work that the racks can run, as a share of all servers, (B,)
                 or one value for all.
         """
+        sent, got, refused, kwh, carbon_g, on_way = np.zeros((6, self._size))
         if self._flows is None:
-            return self._nothing
-        sent, got, refused, kwh, carbon_g = np.zeros((5, self._size))
+            return TransferResult(sent, got, refused, kwh, carbon_g, on_way, state.in_flight)
         in_flight = state.in_flight
         self._sends = shares is not None
         if shares is not None:
