@@ -76,8 +76,8 @@ CLIFF_HALL = (
     "hvac.crac.plenum_coupling=0", "hvac.crac.return_air=common", "hall.layout.containment=0.75",
 )  # fmt: skip
 """Hall of fixed shares, in which excess air changes nothing."""
-QUICK = {"generations": 4, "copies": 96, "pi_steps": 30, "pi_last": 10}
-FULL = {"generations": 45, "copies": 96, "pi_steps": 130, "pi_last": 40}
+QUICK = {"generations": 4, "copies": 96, "pi_steps": 30, "pi_last": 10, "rounds": (1,)}
+FULL = {"generations": 45, "copies": 96, "pi_steps": 130, "pi_last": 40, "rounds": (1, 10)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,8 @@ class Case:
             return found(halls.at(speed, supply_c, self.conditions), 0, supply_c, LIMIT_C)
 
         units = np.flatnonzero(self.conditions.running).tolist()
-        plans = {"idle": {}, **uncoordinated([*units, PLANT], best_response)}
+        ways = uncoordinated([*units, PLANT], best_response, self.effort["rounds"])
+        plans: dict[str, dict[int, float]] = {"idle": {}, **ways}
         return {title_of(way) if way != "idle" else way: evaluate(x) for way, x in plans.items()}
 
     def row(self, hall: str, weather: str, load: str, down: tuple[int, ...]) -> Row:

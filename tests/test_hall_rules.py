@@ -213,6 +213,9 @@ def test_two_common_numbers_win_back_what_local_control_loses(study: Any) -> Non
         assert row.excess["fixed 23 C"] is None
         assert row.best["inlet_max_c"] < 27.01
     assert study.table(rows).count("\n") == 3
+    # All blow less since the others blow, so the hall is too warm.
+    assert rows[0].alone["each alone, played together"] is None
+    assert (rows[0].alone["one after another"] or 99.0) > 1.0
 
 
 @pytest.mark.repo
