@@ -1,4 +1,4 @@
-"""What coordination between the CRAC units of a hall is worth, in steady states.
+"""Compare how much power rules for the CRAC units of a hall need, in steady states.
 
     python benchmarks/hall_agents.py [FOLDER] [--halls 6 16 64] [--servers NAME ...] [--quick]
 

@@ -1,4 +1,4 @@
-"""What eight sites save by sending work to each other: bounds, achieved plans and rules.
+"""Compute the carbon, in %, that eight sites save by sending work to each other.
 
     python examples/fleet_study.py
     python examples/fleet_study.py --weeks 27 --days 2 --flexible 0.2

@@ -160,7 +160,7 @@ def test_maps_show_the_mean_day(folder: Path) -> None:
 
 
 def test_names_on_maps_never_overlap() -> None:
-    """Of 40 sites in a small area the busiest have names; a map may cross the date line."""
+    """A map of 40 close sites names only those with most work, and can span the date line."""
     rng = np.random.default_rng(3)
     place_deg = np.stack(
         [rng.uniform(40, 44, 40), (rng.uniform(178, 184, 40) + 180) % 360 - 180], axis=1

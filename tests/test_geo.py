@@ -92,7 +92,7 @@ def test_plans_of_a_fleet_save_as_much_as_rules_and_can_be_followed() -> None:
         saved = {name: 1.0 - g / emitted["idle"] for name, g in emitted.items()}
         assert saved["geo-central"] > 0.05
         assert saved["geo-mpc"] > 0.95 * saved["geo-central"]
-        # The same view gives the same commands; a new episode begins with a new plan.
+        # Two calls with one view return equal commands, and a reset discards the plan.
         first, second = (make_controller("geo-mpc", sim.fleet) for _ in range(2))
         sim.reset()
         view = view_maker(sim)(None)

@@ -111,7 +111,7 @@ def test_agents_stay_idle_where_no_plan_does_all_work() -> None:
 
 
 def test_the_load_plans_around_a_battery_that_it_knows() -> None:
-    """Where power is billed, work leaves the hours in which a known battery charges."""
+    """With a demand charge, load plans avoid the hours in which the given battery plan charges."""
     configs = [config("tariff.demand_charge_per_kw=1000")]
     drivers = load_drivers(configs)
     task = Task(

@@ -332,7 +332,7 @@ class _Case:
     def best_response(
         self, agent: Agent, others: Mapping[Agent, F64], check: Callable[[], None]
     ) -> F64 | None:
-        """Return the best plan of one agent for known plans of others, (T,).
+        """Return the plan of one agent of least objective while others follow given plans, (T,).
 
         Args:
             agent: Agent of the plan.

@@ -83,7 +83,7 @@ class CommandedHalls:
         """Number n of copies."""
         self._follows = fans == "follow_servers"
         with warnings.catch_warnings():
-            # The same warnings have been issued for the original.
+            # Building the original data center has already issued the same warnings.
             warnings.simplefilter("ignore", OddInputWarning)
             fleet = build_fleet([_with_fans(without_memory(config), fans)] * copies)
         self._fleet, self._inputs = fleet, with_prices(drivers.take([0] * copies), fleet.configs)
