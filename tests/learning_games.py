@@ -8,6 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sdc_taichi.learning.algorithms import (
+    CrossEntropySettings,
+    OffPolicySettings,
+    OnPolicySettings,
+)
 from sdc_taichi.learning.stream import LearnerSpaces, StreamStep
 
 
@@ -15,6 +20,15 @@ def chosen(learner: Any, observation: Tensor) -> list[float]:
     """Choices or numbers of all players from one observation, (n,), side by side."""
     seen = observation[None].numpy()
     return [float(x) for network in learner.networks() for x in network.actions(seen)[0]]
+
+
+COMMON: dict[str, Any] = {"decision_steps": 1, "hidden": (16,), "discount": 0.9, "anneal": False}
+ON = OnPolicySettings(**COMMON, rollout_decisions=6, rate=0.05, epochs=3, mini_batches=1)
+OFF = OffPolicySettings(
+    **COMMON, rollout_decisions=2, gradient_steps=2, batch_size=64, replay_size=2048, n_steps=1,
+    rate=0.01, target_rate=0.05, temperature=0.1,
+)  # fmt: skip
+SEARCH = CrossEntropySettings(decision_steps=1, candidates=16)
 
 
 def weights(learner: Any) -> list[np.ndarray[Any, Any]]:

@@ -11,6 +11,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
 
 from learning_games import (  # noqa: E402
+    OFF,
+    ON,
+    SEARCH,
     Aim,
     Coordination,
     Game,
@@ -25,24 +28,12 @@ from sdc_taichi.errors import ConfigError  # noqa: E402
 from sdc_taichi.learning.algorithms import (  # noqa: E402
     OFF_POLICY,
     ON_POLICY,
-    CrossEntropySettings,
     LearningSettings,
-    OffPolicySettings,
-    OnPolicySettings,
 )
 from sdc_taichi.learning.trainer import make_algorithm  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
-COMMON: dict[str, Any] = {"decision_steps": 1, "hidden": (16,), "discount": 0.9, "anneal": False}
-ON = OnPolicySettings(**COMMON, rollout_decisions=6, rate=0.05, epochs=3, mini_batches=1)
-OFF = OffPolicySettings(
-    **COMMON, rollout_decisions=2, gradient_steps=2, batch_size=64, replay_size=2048, n_steps=1,
-    rate=0.01, target_rate=0.05, temperature=0.1,
-)  # fmt: skip
-
-
-SEARCH = CrossEntropySettings(decision_steps=1, candidates=16)
 SETTINGS: dict[str, LearningSettings] = {
     **dict.fromkeys(ON_POLICY, ON),
     **dict.fromkeys(OFF_POLICY, OFF),

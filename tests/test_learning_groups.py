@@ -15,15 +15,12 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make test-t
 from torch import Tensor  # noqa: E402
 
 import sdc_taichi  # noqa: E402
-from learning_games import Crowd, assert_same_bits, weights  # noqa: E402
+from learning_games import OFF, ON, SEARCH, Crowd, assert_same_bits, weights  # noqa: E402
 from sdc_taichi.control import view_maker  # noqa: E402
 from sdc_taichi.errors import ConfigError  # noqa: E402
 from sdc_taichi.learning import on_policy  # noqa: E402
 from sdc_taichi.learning.algorithms import (  # noqa: E402
-    CrossEntropySettings,
     LearningSettings,
-    OffPolicySettings,
-    OnPolicySettings,
     uses_state,
 )
 from sdc_taichi.learning.controller import PolicyController  # noqa: E402
@@ -38,13 +35,6 @@ from small_halls import DOWN, hall  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
-COMMON: dict[str, Any] = {"decision_steps": 1, "hidden": (16,), "discount": 0.9, "anneal": False}
-ON = OnPolicySettings(**COMMON, rollout_decisions=6, rate=0.05, epochs=3, mini_batches=1)
-OFF = OffPolicySettings(
-    **COMMON, rollout_decisions=2, gradient_steps=2, batch_size=64, replay_size=2048, n_steps=1,
-    rate=0.01, target_rate=0.05, temperature=0.1,
-)  # fmt: skip
-SEARCH = CrossEntropySettings(decision_steps=1, candidates=16)
 SETTINGS: dict[str, LearningSettings] = {
     **dict.fromkeys(("ippo", "mappo", "happo", "haa2c"), ON),
     **dict.fromkeys(("had3qn", "hasac"), OFF),
@@ -87,7 +77,7 @@ def test_agents_of_a_group_learn_as_those_of_as_many_data_centers_to_the_bit() -
     [*((name, True) for name in SETTINGS if name != "cross-entropy"), ("hasac", False)],
 )
 def test_agents_without_effect_change_no_weight(name: str, discrete: bool) -> None:
-    """What they see and are paid is random, by generators that differ between the games."""
+    """Observations and rewards of masked agents are random, with another seed in each game."""
     game, other = Crowd((1,), discrete=discrete), Crowd((1,), discrete=discrete)
     other.noise.manual_seed(1)
     learner = trained(name, game, 3)
@@ -180,7 +170,7 @@ def others() -> Iterator[Simulator]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_policies_of_halls(case: str, env: Any, others: Simulator, tmp_path: Path) -> None:
-    """They learn, go on from a saved state to equal bits, and control halls of other sizes."""
+    """Every algorithm trains, resumes to the same bits, and controls halls of other sizes."""
     name, settings, apart = CASES[case]
     of_env: dict[str, Any] = {
         "joint": name == "ppo",

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sdc_taichi.control.rules import WithoutMemory
 from sdc_taichi.control.view import View
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
@@ -44,7 +45,7 @@ def _to_first(ci: F64, count: int) -> F64:
     return shares
 
 
-class Alone:
+class Alone(WithoutMemory):
     """Rule by which each site decides for itself, without knowledge of what the others send.
 
     Args:
@@ -56,9 +57,6 @@ class Alone:
 
     def __init__(self, destinations: Destinations) -> None:
         self._destinations = destinations
-
-    def reset(self, seed: int | I64) -> None:
-        """Do nothing, because the controller has no memory."""
 
     def act(self, view: View) -> Actions:
         """Return shares of flexible work to send."""

@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sdc_taichi.control.rules import Controller, slots_in_step, trim_and_respond
+from sdc_taichi.control.rules import Controller, WithoutMemory, trimmed_setpoint_c
 from sdc_taichi.control.view import View, limits_of
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.optimum.hall_search import GRID, cost_w, one_speed
 from sdc_taichi.plant.cooling import avoid_repeats
@@ -18,7 +19,7 @@ from sdc_taichi.sim.commanded_halls import CommandedHalls, HallConditions
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Actions
 
-LIMIT_C = 27.0
+LIMIT_C = RECOMMENDED_C[1]
 """Highest server inlet that rules allow, in C: the highest that ASHRAE TC 9.9 recommends."""
 REQUEST_C = 26.0
 """Measured inlet above which the zone of a unit requests cooling, in C."""
@@ -33,7 +34,7 @@ GRIDS = 3
 """Number of grids of 96 pairs of speed and setpoint by which ``one-speed`` searches in a step."""
 
 
-class FollowNeed:
+class FollowNeed(WithoutMemory):
     """Fans that supply what the racks need.
 
     Args:
@@ -47,9 +48,6 @@ class FollowNeed:
     def __init__(self, setpoint_c: float | str | None = None) -> None:
         self._setpoint_c = setpoint_c
         self._halls = _Halls(SETPOINTS, "follow_servers")
-
-    def reset(self, seed: object) -> None:
-        """Do nothing, because the controller has no memory."""
 
     def act(self, view: View) -> Actions:
         """Return commands for setpoints and fans."""
@@ -100,7 +98,7 @@ class InletControl:
         return unit_actions(view, speed, np.full(fleet.units, self._setpoint_c))
 
 
-class TrimAndRespondByZone:
+class TrimAndRespondByZone(WithoutMemory):
     """Common setpoint by trim and respond, with requests of zones; fans supply the racks' need.
 
     The sequence is that of ASHRAE Guideline 36 (2021), section 5.1.14: every 5 min +0.1 K, and
@@ -111,25 +109,14 @@ class TrimAndRespondByZone:
     commands = ("cooling", "fan")
     """Fields of ``Actions`` that it gives."""
 
-    def reset(self, seed: object) -> None:
-        """Do nothing, because the controller has no memory."""
-
     def act(self, view: View) -> Actions:
         """Return commands for setpoints and fans."""
         requests = view.fleet.unit_sums(view.zone_hottest_c > REQUEST_C)
-        target_c = view.setpoint_c
-        for _ in range(slots_in_step(view.state.step, view.step_h)):
-            target_c = trim_and_respond(
-                target_c,
-                requests,
-                low_c=view.limits.setpoint_low_c,
-                high_c=view.limits.setpoint_high_c,
-                ignored=1,
-            )
+        target_c = trimmed_setpoint_c(view, requests, ignored=1)
         return unit_actions(view, needed_speed(view), target_c[view.fleet.unit_dc])
 
 
-class OneSpeed:
+class OneSpeed(WithoutMemory):
     """One speed and one setpoint for all units, of least power in the steady state of the step.
 
     Args:
@@ -142,9 +129,6 @@ class OneSpeed:
     def __init__(self, limit_c: float = LIMIT_C) -> None:
         self._limit_c = limit_c
         self._halls = _Halls(GRID[0] * GRID[1], "controlled")
-
-    def reset(self, seed: object) -> None:
-        """Do nothing, because the controller has no memory."""
 
     def act(self, view: View) -> Actions:
         """Return commands for setpoints and fans."""

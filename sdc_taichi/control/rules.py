@@ -14,16 +14,18 @@ import numpy.typing as npt
 
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
 """Interval at which trim and respond changes the setpoint, in min."""
-REQUEST_INLET_C = 27.0
+REQUEST_INLET_C = RECOMMENDED_C[1]
 """Inlet temperature above which a rack requests cooling, in C: the highest one that ASHRAE TC 9.9
 recommends."""
+IGNORED = 2
+"""Number of requests for cooling without a response (ASHRAE Guideline 36)."""
 COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "load": ("load", "placement"),
     "cooling": ("cooling", "fan", "placement", "chilled_water"),
@@ -61,14 +63,14 @@ class Controller(Protocol):
         """
 
 
-class _WithoutMemory:
+class WithoutMemory:
     """Base class of controllers whose commands depend on the view alone."""
 
     def reset(self, seed: int | I64) -> None:
         """Do nothing, because the controller has no memory."""
 
 
-class Idle(_WithoutMemory):
+class Idle(WithoutMemory):
     """Neutral commands: no work moves, the battery rests, setpoints hold or follow a schedule."""
 
     commands: tuple[str, ...] = ()
@@ -117,7 +119,7 @@ class Random:
         return [np.random.SeedSequence(pair) for pair in pairs]
 
 
-class TrimAndRespond(_WithoutMemory):
+class TrimAndRespond(WithoutMemory):
     """Supply setpoint by trim and respond of ASHRAE Guideline 36 (2021), section 5.1.14.
 
     Every 5 min the setpoint rises a little, or falls if racks request cooling. A step of 15 min
@@ -137,18 +139,10 @@ class TrimAndRespond(_WithoutMemory):
                 view.last.rack_inlet_max_c > REQUEST_INLET_C + LEAST_EXCESS_K, dtype=np.float64
             )
             requests = np.add.reduceat(hot, view.fleet.rack_offsets[:-1])
-        target_c = view.setpoint_c
-        for _ in range(slots_in_step(view.state.step, view.step_h)):
-            target_c = trim_and_respond(
-                target_c,
-                requests,
-                low_c=view.limits.setpoint_low_c,
-                high_c=view.limits.setpoint_high_c,
-            )
-        return Actions(cooling=setpoint_command(target_c, view))
+        return Actions(cooling=setpoint_command(trimmed_setpoint_c(view, requests), view))
 
 
-class FixedSetpoint(_WithoutMemory):
+class FixedSetpoint(WithoutMemory):
     """Controller that sets a constant setpoint with its first command.
 
     Args:
@@ -172,7 +166,7 @@ class FixedSetpoint(_WithoutMemory):
         return Actions(cooling=setpoint_command(target_c, view))
 
 
-class Lookahead(_WithoutMemory):
+class Lookahead(WithoutMemory):
     """Battery controller that compares the carbon intensity with its forecast for a time window.
 
     The battery charges at full power if the present intensity is in the lowest quarter of the
@@ -197,7 +191,7 @@ class Lookahead(_WithoutMemory):
         return Actions(battery=np.where(pays, quartile_command(ci), 0.0))
 
 
-class GreedyCarbon(_WithoutMemory):
+class GreedyCarbon(WithoutMemory):
     """Controller of work and battery that compares the carbon intensity with its forecast mean.
 
     If the present intensity is above the mean of the coming window, work is deferred and the
@@ -283,6 +277,26 @@ def commands_of(controller: Controller) -> tuple[str, ...]:
     return tuple(getattr(controller, "commands", AGENTS))
 
 
+def trimmed_setpoint_c(view: View, requests: npt.ArrayLike, ignored: int = IGNORED) -> F64:
+    """Return the setpoint after trim and respond in all intervals of a step, in C, (B,).
+
+    Args:
+        view: The view before the step.
+        requests: Number of requests for cooling, (B,).
+        ignored: Number of requests without a response.
+    """
+    target_c = view.setpoint_c
+    for _ in range(slots_in_step(view.state.step, view.step_h)):
+        target_c = trim_and_respond(
+            target_c,
+            requests,
+            low_c=view.limits.setpoint_low_c,
+            high_c=view.limits.setpoint_high_c,
+            ignored=ignored,
+        )
+    return target_c
+
+
 def trim_and_respond(
     setpoint_c: F64,
     requests: npt.ArrayLike,
@@ -292,7 +306,7 @@ def trim_and_respond(
     trim_k: float = 0.1,
     respond_k: float = -0.2,
     max_respond_k: float = -0.6,
-    ignored: int = 2,
+    ignored: int = IGNORED,
 ) -> F64:
     """Apply one interval of trim and respond (ASHRAE Guideline 36-2021, 5.1.14) to a setpoint.
 

@@ -104,6 +104,7 @@ class AgentActions:
         self._setpoint_change_k = options.setpoint_change_k
         self._setpoint_step_k = fleet.values("hvac.setpoint.step_k")[fleet.unit_dc]
         self._fan_steps = options.fan_change / fleet.values("hvac.crac.fan_step")[fleet.unit_dc]
+        self._lowest_setpoint_c = fleet.values("hvac.setpoint.min_c")[fleet.unit_dc]
         self._coil_approach_k = fleet.values("hvac.chiller.coil_approach_k")
         self._water_range_c = CHILLERS[fleet.models["chiller"]].water_range_c
 
@@ -222,7 +223,7 @@ class AgentActions:
         fleet, (low_c, high_c) = self._fleet, self._water_range_c
         change_k = commands.get("cooling", np.zeros(1)) * self._setpoint_step_k
         unit_c = np.minimum(state.setpoint_c, state.setpoint_c + change_k)
-        unit_c = np.maximum(unit_c, fleet.values("hvac.setpoint.min_c")[fleet.unit_dc])
+        unit_c = np.maximum(unit_c, self._lowest_setpoint_c)
         coldest_c = np.minimum.reduceat(unit_c, fleet.unit_offsets[:-1])
         most_c = coldest_c - fleet.setpoint_over_supply_k - self._coil_approach_k
         chilled_c = most_c + CHILLED_WATER_SPAN_K * np.minimum(reset, 0.0)

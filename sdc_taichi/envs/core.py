@@ -57,10 +57,10 @@ from sdc_taichi.envs.options import ConfigDraw, EnvOptions
 from sdc_taichi.envs.recording import EpisodeRecordings, RecorderOption
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.unit_slots import UnitSlots
-from sdc_taichi.envs.view_terms import RECOMMENDED_C
+from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
-from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
-from sdc_taichi.sim.drivers import local_start
+from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.sim.drivers import local_start, utc_start
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet_configs import MOST_DCS, with_sites
 from sdc_taichi.sim.hall_solver import Precision
@@ -580,7 +580,7 @@ class Core:
         if not groups:
             return {}
         view = self.view
-        over_k = np.maximum(view.zone_hottest_true_c - RECOMMENDED_C, 0.0)
+        over_k = np.maximum(view.zone_hottest_true_c - HIGHEST_RECOMMENDED_C, 0.0)
         heat = self._slots.fill(over_k * (0.0 if view.last is None else view.step_h))
         return dict.fromkeys(groups, heat)
 
@@ -594,8 +594,8 @@ class Core:
         start = self.view.state.start[:: self._sites]
         if self._sites > 1:
             offset_h = self.view.drivers.utc_offset_h[:: self._sites]
-            offset = (offset_h * self.sim.fleet.steps_per_hour).astype(np.int64)
-            start = (start - offset) % (DAYS_PER_YEAR * self._steps_per_day)
+            in_utc = utc_start(start, offset_h, self.sim.fleet.steps_per_hour)
+            start = in_utc.astype(np.int64)
         start = start // self._steps_per_day
         drawn: dict[str, npt.NDArray[Any]] = self._by_env(draw_info(self._draw))
         return {"start_day": np.asarray(start, dtype=np.int64), **drawn}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.view_terms import RECOMMENDED_C
+from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
@@ -39,7 +39,7 @@ def hot_inlets(result: StepResult, view: View) -> F64:
 
 def hottest_inlet(result: StepResult, view: View) -> F64:
     """Excess of the hottest inlet over the recommended 27 C, in K h."""
-    return np.maximum(result.inlet_max_c - RECOMMENDED_C, 0.0) * result.step_h
+    return np.maximum(result.inlet_max_c - HIGHEST_RECOMMENDED_C, 0.0) * result.step_h
 
 
 def throttled_racks(result: StepResult, view: View) -> F64:

@@ -541,7 +541,8 @@ def site_ci_forecast(view: View) -> F64:
     """Forecasts of the CI of the other sites in 6 and 24 h, in the order of `site_ci`."""
     ahead = [round(lead_h / view.step_h) for lead_h in SITE_LEADS_H]
     forecast = view.forecast(SITE_LEADS_H[-1] + view.step_h).ci_g_per_kwh
-    return np.concatenate([_of_others(view, forecast[:, lead]) for lead in ahead])
+    of_leads = _of_others(view, forecast[:, ahead].T)
+    return np.concatenate(np.moveaxis(of_leads, 1, 0))
 
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: x.other_sites)
@@ -571,10 +572,14 @@ def transfers(view: View) -> F64:
 
 
 def _of_others(view: View, of_sites: F64) -> F64:
-    """Return values of the other sites, that with the cleanest grid first, (S - 1, B)."""
+    """Return values of the other sites, (..., B), that with the cleanest grid first.
+
+    Returns:
+        Values of shape (S - 1, ..., B).
+    """
     sites = view.fleet.sites_per_fleet
     first = np.repeat(np.arange(0, view.size, sites), sites)[:, None]
-    return np.asarray(of_sites[first + cleaner_first(view)].T)
+    return np.moveaxis(of_sites[..., first + cleaner_first(view)], -1, 0)
 
 
 def _highest_of_running(view: View, per_unit: F64) -> F64:
@@ -621,8 +626,6 @@ def features_by_agent(
         by_name = {feature.name: feature for feature in of_agent}
         acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
         default = [n for n in (*AGENT_DEFINITIONS[agent].features, *acted_on) if n in by_name]
-        if AGENT_DEFINITIONS[agent].per_unit:
-            default = [n for n in default if n != "fan_speed"]
         names = chosen.get(agent, default)
         if isinstance(names, str) or not names:
             raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")

@@ -26,6 +26,7 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import check_controller, commands_of
+from sdc_taichi.control.unit_zones import MOST_NEIGHBOURS
 from sdc_taichi.control.view import PERFECT, ForecastError
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, ALL_AGENTS, HALL_AGENTS, Agent
 from sdc_taichi.envs.features import (
@@ -118,7 +119,7 @@ class EnvOptions(BaseModel):
     """Leads of the weather forecasts, in h."""
     forecast_error: ForecastError = PERFECT
     """Errors of the forecasts of carbon intensity and weather."""
-    neighbours: Annotated[int, Field(strict=True, ge=0, le=8), PLAIN_INT] = 0
+    neighbours: Annotated[int, Field(strict=True, ge=0, le=MOST_NEIGHBOURS), PLAIN_INT] = 0
     """Number of neighbouring CRAC units whose fan speeds and hottest inlets an agent ``crac``
     observes, 0..8."""
     heat_map: bool = False

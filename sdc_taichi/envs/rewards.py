@@ -282,7 +282,7 @@ class Rewards:
                     term = term[fleet.unit_dc]
                 value = value + scale * term
             individual[agent] = value + by_agent.get(agent, 0.0)
-        number = {a: fleet.unit_sums(np.ones(fleet.units)) for a in self._team if a in _OF_UNITS}
+        number = {a: np.diff(fleet.unit_offsets) for a in self._team if a in _OF_UNITS}
         sums = {a: fleet.unit_sums(x) if a in _OF_UNITS else x for a, x in individual.items()}
         total = _sum(list(sums.values()))
         others = _sum([number.get(a, np.ones(view.size)) for a in self._team]) - 1.0

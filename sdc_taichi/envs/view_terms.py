@@ -22,6 +22,7 @@ import numpy as np
 
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.reward_terms import CI_G_PER_KWH, TermContext
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.stages import SteadyFacility
 from sdc_taichi.sim.transfer import task_kwh
@@ -29,7 +30,7 @@ from sdc_taichi.types import F64, I64, StepResult
 
 UTILISATIONS = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 1.0])
 """Utilisations at which the power of ``follow`` is computed; values between are interpolated."""
-RECOMMENDED_C = 27.0
+HIGHEST_RECOMMENDED_C = RECOMMENDED_C[1]
 """Highest inlet temperature that ASHRAE TC 9.9 recommends, in C."""
 
 
@@ -89,7 +90,7 @@ def hall_power(r: StepResult, v: View, c: ViewContext) -> F64:
 
 def hall_heat(r: StepResult, v: View, c: ViewContext) -> F64:
     """Excess of the hottest inlet over the recommended 27 C, in K (ASHRAE TC 9.9)."""
-    return -np.maximum(r.inlet_max_c - RECOMMENDED_C, 0.0)
+    return -np.maximum(r.inlet_max_c - HIGHEST_RECOMMENDED_C, 0.0)
 
 
 def zone_power(r: StepResult, v: View, c: ViewContext) -> F64:
@@ -114,7 +115,7 @@ def zone_power(r: StepResult, v: View, c: ViewContext) -> F64:
 
 def zone_heat(r: StepResult, v: View, c: ViewContext) -> F64:
     """Excess of the hottest inlet of the own zone over the recommended 27 C, in K."""
-    return -np.maximum(v.zone_hottest_true_c - RECOMMENDED_C, 0.0)
+    return -np.maximum(v.zone_hottest_true_c - HIGHEST_RECOMMENDED_C, 0.0)
 
 
 def geo_carbon(r: StepResult, v: View, c: ViewContext) -> F64:

@@ -431,6 +431,19 @@ def local_start(start_utc: I64, utc_offset_h: F64, steps_per_hour: int) -> I64:
     return np.where(local < 0, local + HOURS_PER_YEAR * steps_per_hour, local)
 
 
+def utc_start(local_start: I64, utc_offset_h: F64, steps_per_hour: int) -> F64:
+    """Return first steps in UTC, within the year, for first steps in local standard time, (B,).
+
+    They are no whole numbers where an offset is no whole number of steps.
+
+    Args:
+        local_start: First step of each data center in local standard time, (B,).
+        utc_offset_h: Local standard time minus UTC, in h, (B,).
+        steps_per_hour: Number of steps in an hour.
+    """
+    return (local_start - utc_offset_h * steps_per_hour) % (HOURS_PER_YEAR * steps_per_hour)
+
+
 def is_file(trace: str) -> bool:
     """Return True if ``trace`` is a file path, which contains a dot or a slash, not a name."""
     return "." in trace or "/" in trace or os.sep in trace

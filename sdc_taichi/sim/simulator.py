@@ -13,13 +13,12 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
-from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air, with_entries_of
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.crac_units import Supply
-from sdc_taichi.sim.drivers import Drivers, load_drivers
+from sdc_taichi.sim.drivers import Drivers, load_drivers, utc_start
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import HallSums, Precision
@@ -501,8 +500,7 @@ class Simulator:
         Raises:
             ConfigError: They begin at different times.
         """
-        per_hour = self.fleet.steps_per_hour
-        utc = (drivers.start - drivers.utc_offset_h * per_hour) % (HOURS_PER_YEAR * per_hour)
+        utc = utc_start(drivers.start, drivers.utc_offset_h, self.fleet.steps_per_hour)
         of_fleets = utc.reshape(-1, self.fleet.sites_per_fleet)
         same = (of_fleets == of_fleets[:, :1]).reshape(-1)
         if not same.all():
