@@ -320,7 +320,7 @@ def test_a_joint_learner_gets_one_value_for_all_once() -> None:
 @pytest.mark.parametrize(
     ("rewards", "message"),
     [
-        ("sustain", "'sustain': unknown; valid: default, bill, paper, own, sustaindc"),
+        ("sustain", "'sustain': unknown; valid: default, bill, paper, sustaindc"),
         ("no_such_module:f", "cannot be imported"),
         ("math:pi", "is a float; valid is a function"),
         ({"agent_xy": {}}, "unknown agent 'agent_xy'"),
@@ -330,7 +330,7 @@ def test_a_joint_learner_gets_one_value_for_all_once() -> None:
         ({"agent_ls": {"carbon": True}}, "carbon is True; valid is a number"),
         ({"agent_ls": ["carbon"]}, "valid is a dict of term to scale"),
         ({"carbon": 1.0}, "unknown agent 'carbon'; valid: agent_ls, agent_dc, agent_bat"),
-        (3, "rewards 3: unknown; valid: default, bill, paper, own, sustaindc"),
+        (3, "rewards 3: unknown; valid: default, bill, paper, sustaindc"),
     ],
 )
 def test_wrong_rewards_are_named(rewards: Any, message: str) -> None:

@@ -113,7 +113,7 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         part="cooling",
         commands=("cooling", "chilled_water"),
         features=("outdoor", "wet_bulb", "dc_load", *_HALL, "setpoint_mean", "chilled_water"),
-        scales={"default": _TEAM_OF_HALL, "own": _TEAM_OF_HALL},
+        scales={"default": _TEAM_OF_HALL},
         also_controlled=("placement",),
     ),
 }
@@ -127,7 +127,8 @@ Reward set ``default`` charges each agent for the part of the carbon emissions t
 Reward set ``bill`` uses prices instead of carbon intensity and adds a charge for high power. Reward
 set ``paper`` contains r_LS, r_DC and r_BAT of the paper (4.5, F.2), with carbon and energies
 divided by their values at the design point. In reward set ``own`` an agent of a CRAC unit has a
-part of the reward that all agents of a hall share in ``default``.
+part of the reward that all agents of a hall share in ``default``; all other agents have their
+rewards of ``default``.
 """
 
 

@@ -126,7 +126,7 @@ class EnvOptions(BaseModel):
     """True if every observation is a dict of features and an image of the hall."""
     rewards: Any = "default"
     """Rewards of the agents. Valid are the reward sets ``default``, ``bill``, ``paper`` and
-    ``sustaindc``, and for agents of a hall ``own``; a dict of agent to term to scale; or a
+    ``sustaindc`` and, for agents of CRAC units, ``own``; a dict of agent to term to scale; or a
     function, by the object, by its registered name (``register_reward``) or by its import path
     ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8

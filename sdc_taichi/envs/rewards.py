@@ -41,13 +41,13 @@ RewardFunction = Callable[[StepResult, View], Any]
 rewards, (B,), for every learning agent, or a dict of rewards by learning group, (B,) each, or (U,)
 for a group with an agent for each CRAC unit."""
 
-_COUNTED_ONCE = ("default", "bill")
+_COUNTED_ONCE = ("default", "bill", "own")
 """Reward sets whose joint reward counts each term once, even if several agents have this term. The
 joint reward of all other sets is the sum of the agents' rewards."""
-SCALED_SETS = (*_COUNTED_ONCE, "paper", "own")
-"""Reward sets that are sums of terms, multiplied by the scales of ``AGENT_DEFINITIONS``."""
-REWARD_SETS = (*SCALED_SETS, "sustaindc")
+REWARD_SETS = ("default", "bill", "paper", "sustaindc", "own")
 """Names of the built-in reward sets that the option ``rewards`` accepts."""
+SCALED_SETS = tuple(name for name in REWARD_SETS if name != "sustaindc")
+"""Reward sets that are sums of terms, multiplied by the scales of ``AGENT_DEFINITIONS``."""
 
 _OF_UNITS = {agent for agent, definition in AGENT_DEFINITIONS.items() if definition.per_unit}
 """Groups with an agent for each CRAC unit."""
@@ -342,8 +342,17 @@ def _peak_kw(before_kw: F64, result: StepResult) -> F64:
 
 
 def _scales_of(agent: str, rewards: str) -> dict[str, float]:
-    """Return the scales of an agent in a reward set; the agent has none if it does not learn."""
+    """Return the scales of an agent in a reward set.
+
+    In reward set ``own`` agents without scales of their own have those of ``default``, which
+    already are their own parts.
+
+    Raises:
+        ConfigError: the agent has no scales in this set.
+    """
     scales = AGENT_DEFINITIONS[agent].scales
+    if rewards == "own" and rewards not in scales:
+        return scales["default"]
     if rewards not in scales:
         raise ConfigError(f"rewards {rewards!r}: {agent} has none; valid are {', '.join(scales)}")
     return scales[rewards]
