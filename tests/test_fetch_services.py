@@ -201,7 +201,9 @@ def archive(**files: bytes) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
         for name, content in files.items():
-            made.writestr(name.replace("_epw", ".epw"), content)
+            # The bytes name the tests: a time of day would name them otherwise in each process.
+            entry = zipfile.ZipInfo(name.replace("_epw", ".epw"))
+            made.writestr(entry, content, zipfile.ZIP_DEFLATED)
     return packed.getvalue()
 
 
