@@ -40,7 +40,7 @@ DOWN = hall(
 )
 FLEET = load_config("fleet_of_eight", ["fleet.sites=[AZ, CA, WA]"])
 TWICE: dict[str, Any] = {"agents": ["crac", "agent_dc"], "commands": {"agent_dc": ["fan"]}}
-WRONG = {"crac": {"carbon": 1.0}}
+WRONG = {"crac": {"zone_carbon": 1.0}}
 GEO: dict[str, Any] = {
     "config": FLEET,
     "agents": (*AGENTS, "agent_geo"),
@@ -323,7 +323,7 @@ def test_joint_reward_of_a_fleet_is_the_mean_of_its_sites() -> None:
         (lambda: HALL_ENV("corrected"), "hvac.crac.flow_model=controlled"),
         (lambda: HALL_ENV(HALL, **TWICE), "fan is decided by agent_dc and crac"),
         (lambda: HALL_ENV(HALL, rewards="bill"), "rewards 'bill': crac has none"),
-        (lambda: HALL_ENV(HALL, rewards=WRONG), "unknown term 'carbon'"),
+        (lambda: HALL_ENV(HALL, rewards=WRONG), "unknown term 'zone_carbon'"),
         (lambda: HALL_ENV(HALL, neighbours=9), "neighbours"),
         (lambda: PARALLEL_ENV(neighbours=1), "crac does not learn"),
         (lambda: PARALLEL_ENV(FLEET, heat_map=True), "heat_map True: in a fleet"),

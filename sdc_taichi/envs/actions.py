@@ -11,10 +11,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.site_order import cleaner_first, shares_of_sites
-from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.unit_slots import UnitSlots, slots_of_groups
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.cooling import avoid_repeats
@@ -41,7 +40,7 @@ class AgentActions:
         fleet: the B data centers, with U CRAC units and R racks in total.
         options: learning agents, their commands and the meaning of their actions.
         clip: whether continuous actions are clipped to -1..1 if ``options.clip_actions`` is None.
-        slots: places of CRAC units in the actions of their agents; None means as few as fit.
+        slots: places of units in the actions of their agents by group; None means as few as fit.
 
     Attributes:
         spaces: action space of a learning agent, by group.
@@ -59,7 +58,7 @@ class AgentActions:
         options: EnvOptions,
         *,
         clip: bool = False,
-        slots: UnitSlots | None = None,
+        slots: Mapping[str, UnitSlots] | None = None,
     ) -> None:
         self._clip = clip if options.clip_actions is None else options.clip_actions
         self._agents: tuple[str, ...] = options.agents
@@ -69,8 +68,8 @@ class AgentActions:
         _check_models(fleet, self.commands)
         if "transfer" in self.commands and fleet.sites_per_fleet == 1:
             raise ConfigError("agents: agent_geo needs a fleet; valid with a config that has fleet")
-        self._fleet, self._slots = fleet, UnitSlots(fleet) if slots is None else slots
-        self._of_units = {a for a in self._agents if AGENT_DEFINITIONS[a].per_unit}
+        self._fleet = fleet
+        self._slots = slots_of_groups(fleet, self._agents) if slots is None else slots
         widths: dict[str, dict[str, int]] = {
             agent: {name: self._width(agent, name) for name in names}
             for agent, names in decided.items()
@@ -113,8 +112,8 @@ class AgentActions:
 
         Args:
             actions: actions by learning agent. Discrete actions are integers, (B,), or (B, k) if
-                the agent decides k values; continuous actions are floats, (B, k). Those of CRAC
-                units have a second axis, the slots of ``UnitSlots``, after the first.
+                the agent decides k values; continuous actions are floats, (B, k). Those of groups
+                with an agent for each unit have a second axis, the slots of ``UnitSlots``.
             view: the view before the step.
 
         Raises:
@@ -129,8 +128,9 @@ class AgentActions:
             action = self._checked(agent, actions)
             for name, columns in self._columns[agent]:
                 part = action if columns is None else action[..., columns]
-                if agent in self._of_units:
-                    part = self._slots.units(part.reshape(self._slots.exists.shape))
+                if agent in self._slots:
+                    slots = self._slots[agent]
+                    part = slots.units(part.reshape(slots.exists.shape))
                 elif agent == "plant" and name == "cooling":
                     part = part.reshape(-1)[self._fleet.unit_dc]
                 commands[name] = self._command(name, part.reshape(-1), state)
@@ -167,8 +167,8 @@ class AgentActions:
                 rows = self._rows(agent, name, command)
                 parts.append(self._action(name, np.broadcast_to(rows, (len(rows), count))))
             together = np.concatenate(parts, axis=1)
-            if agent in self._of_units:
-                together = np.moveaxis(self._slots.fill(together.T), 0, -1)
+            if agent in self._slots:
+                together = np.moveaxis(self._slots[agent].fill(together.T), 0, -1)
             actions[agent] = together.reshape(shape)
         return actions
 
@@ -184,9 +184,10 @@ class AgentActions:
                 f"command chilled_water {command.flat[0]:g} C: no action of {agent} gives it; "
                 "valid is None"
             )
-        if agent in self._of_units:
-            of_units = command.ndim and len(command) == fleet.units
-            return command.reshape(-1, 1) if of_units else self._of_all(command)[fleet.unit_dc]
+        if agent in self._slots:
+            slots = self._slots[agent]
+            of_units = command.ndim and len(command) == slots.count
+            return command.reshape(-1, 1) if of_units else self._of_all(command)[slots.dc]
         if agent == "plant" and command.shape == (fleet.units,):
             return command[fleet.unit_offsets[:-1], None]
         if command.ndim == 0:
@@ -208,8 +209,8 @@ class AgentActions:
         return 1
 
     def _rows_shape(self, agent: str) -> tuple[int, ...]:
-        """Return (B,), or (B, W) for a group with an agent for each CRAC unit."""
-        return self._slots.exists.shape if agent in self._of_units else (self._fleet.size,)
+        """Return (B,), or (B, W) for a group with an agent for each unit."""
+        return self._slots[agent].exists.shape if agent in self._slots else (self._fleet.size,)
 
     def _chilled_water_c(self, reset: F64, commands: Mapping[str, F64], state: State) -> F64:
         """Return the commanded temperature of the chilled water, in C, (B,).

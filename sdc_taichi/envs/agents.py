@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS
+
 Agent = Literal["agent_ls", "agent_dc", "agent_bat", "agent_geo", "crac", "plant"]
 """Name of a group of agents. The first three are the agents of the released SustainDC: load
 shifting, cooling, battery."""
@@ -33,10 +35,15 @@ class AgentDefinition:
     """Names of the features that an agent observes by default, in order."""
     scales: dict[str, dict[str, float]]
     """Factors of an agent's reward terms, by reward set and term."""
-    per_unit: bool = False
-    """True if the group has an agent for each CRAC unit, False for one agent per data center."""
+    axis: str = DATA_CENTERS
+    """Kind of element for which the group has an agent each: data centers or CRAC units."""
     also_controlled: tuple[str, ...] = ()
     """Fields of ``Actions`` that no agent of the group sets, but a controller in its place."""
+
+    @property
+    def per_unit(self) -> bool:
+        """True if the group has an agent for each unit of a kind, False for one per data center."""
+        return self.axis != DATA_CENTERS
 
     @property
     def command(self) -> str:
@@ -107,7 +114,7 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         commands=("fan", "cooling"),
         features=(*_OWN_UNIT, "chilled_water", "time_of_day"),
         scales={"default": _TEAM_OF_HALL, "own": {"zone_power": 1.0, "zone_heat": 0.2}},
-        per_unit=True,
+        axis=CRAC_UNITS,
     ),
     "plant": AgentDefinition(
         part="cooling",
@@ -155,7 +162,7 @@ def members_of(group: str, units: int) -> tuple[str, ...]:
 
     Args:
         group: name of the group.
-        units: number of CRAC units of the data center.
+        units: number of units of the data center, of the kind for which the group has agents.
     """
     if not AGENT_DEFINITIONS[group].per_unit:
         return (group,)

@@ -56,7 +56,7 @@ from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import ConfigDraw, EnvOptions
 from sdc_taichi.envs.recording import EpisodeRecordings, RecorderOption
 from sdc_taichi.envs.rewards import Rewards
-from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.unit_slots import slots_of_groups
 from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
@@ -65,13 +65,22 @@ from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet_configs import MOST_DCS, with_sites
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F32, F64, I64, QUANTITIES_PER_DC, Actions, State, StepResult
+from sdc_taichi.types import (
+    CRAC_UNITS,
+    F32,
+    F64,
+    I64,
+    QUANTITIES_PER_DC,
+    Actions,
+    State,
+    StepResult,
+)
 
 Observation = F32 | dict[str, F32]
 """Observations of a group of agents in E environments: an array (E, n), or with option ``heat_map``
 a dict of ``features``, (E, n), and ``heat_map``, (E, rows, racks per row, channels). Features of a
-group with W agents are (E, W, n), and its rewards (E, W): one agent for each CRAC unit, or in a
-fleet that shares work for each site."""
+group with W agents are (E, W, n), and its rewards (E, W): one agent for each unit, or in a fleet
+that shares work for each site."""
 
 
 REWARD_BEYOND_LIMITS = -1000.0
@@ -141,8 +150,9 @@ class Core:
         options: actions, observations and rewards of the agents.
         agents: names of the groups of agents that learn.
         members: names of the agents of each learning group in one environment. A group with an
-            agent for each CRAC unit has as many as the data center with the most units. In a fleet,
+            agent for each unit has as many as the data center with the most units. In a fleet,
             every group has an agent for each site, such as ``NY/agent_geo``.
+        slots: places of the agents in arrays, by learning group with an agent for each unit.
         num_envs: number of environments, E.
         steps: number of steps of an episode.
         sim: simulator of all B data centers.
@@ -176,13 +186,13 @@ class Core:
             self.num_envs = size = _checked_size(1 if num_envs is None else num_envs, 1)
             self._config_keys: I64 | None = np.arange(size, dtype=np.int64)
             by_env = configs.configs(self._config_keys)
-            self._width = configs.most_units
+            most = configs.most_units
+            self._widths = {} if most is None else {CRAC_UNITS: most}
         else:
             self.num_envs = size = _checked_size(num_envs, len(configs))
             self._config_keys = None
             by_env = [configs[i % len(configs)] for i in range(size)]
-            self._width = None
-        self._of_units = {a for a in self.agents if AGENT_DEFINITIONS[a].per_unit}
+            self._widths = {}
         self._learned_commands = [name for a in self.agents for name in options.commands_of(a)]
         self._rewards = Rewards(
             options.rewards,
@@ -252,11 +262,11 @@ class Core:
             self.agents, self._learned_commands, commands_of(self._others)
         )
         self._costs = Costs(options.costs, fleet)
-        self._slots = UnitSlots(fleet, self._width)
+        self.slots = slots_of_groups(fleet, self.agents, self._widths)
         self._observer = make_observer(
-            fleet, options, new_inputs=draws_inputs(options), slots=self._slots
+            fleet, options, new_inputs=draws_inputs(options), slots=self.slots
         )
-        self._decoder = AgentActions(fleet, options, clip=self._clips, slots=self._slots)
+        self._decoder = AgentActions(fleet, options, clip=self._clips, slots=self.slots)
         self.features: dict[str, tuple[Feature, ...]] = {
             a: self._observer.features[a] for a in self.agents
         }
@@ -365,7 +375,7 @@ class Core:
         self._last = None
         self._view = view = self._view_after(None)
         self._observer.reset(view)
-        self._rewards.reset(view, self._slots)
+        self._rewards.reset(view, self.slots)
 
     def restart_ended(self) -> npt.NDArray[np.bool_]:
         """Start the next episodes of the environments ``ended_early``, which end with the batch.
@@ -487,8 +497,8 @@ class Core:
         return transition
 
     def _reward_of_dcs(self, agent: str, reward: F64) -> F64:
-        """Return the reward of a group for each data center, of CRAC units their mean, (B,)."""
-        return reward.mean(axis=1) if agent in self._of_units else reward.reshape(-1)
+        """Return the reward of a group for each data center, of units their mean, (B,)."""
+        return reward.mean(axis=1) if agent in self.slots else reward.reshape(-1)
 
     def _by_env(self, of_dcs: Any) -> Any:
         """Arrange values of data centers, (B, ...), by site of a fleet, (E, S, ...); see ``Core``.
@@ -518,8 +528,8 @@ class Core:
 
     def _names_of(self, agent: str) -> tuple[str, ...]:
         """Return the names of the agents of a group in one environment."""
-        if agent in self._of_units:
-            return members_of(agent, self._slots.width)
+        if agent in self.slots:
+            return members_of(agent, self.slots[agent].width)
         if self._sites == 1:
             return (agent,)
         sites = [config.site.location for config in self.sim.fleet.configs[: self._sites]]
@@ -560,15 +570,18 @@ class Core:
         return idle
 
     def masks(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return True for the agents that act, by group with an agent for each CRAC unit, (B, W).
+        """Return True for the agents that act, by group with an agent for each unit, (B, W).
 
         The action of an agent is without effect if its unit was down in the last step, or does not
         exist.
         """
-        if not self._of_units:
+        if not self.slots:
             return {}
-        running = self._slots.fill(self.view.unit_running) > 0
-        return {a: running & self._slots.exists for a in self.agents if a in self._of_units}
+        running = {CRAC_UNITS: self.view.unit_running}
+        return {
+            agent: (slots.fill(running[AGENT_DEFINITIONS[agent].axis]) > 0) & slots.exists
+            for agent, slots in self.slots.items()
+        }
 
     def zone_heat_k_h(self) -> dict[str, F64]:
         """Return the excess of the hottest inlet of each agent's zone over 27 C, in K h, (B, W).
@@ -576,13 +589,12 @@ class Core:
         It is that of the last step, by learning group with an agent for each CRAC unit, and 0
         before the first step.
         """
-        groups = [agent for agent in self.agents if agent in self._of_units]
-        if not groups:
+        if "crac" not in self.slots:
             return {}
         view = self.view
         over_k = np.maximum(view.zone_hottest_true_c - HIGHEST_RECOMMENDED_C, 0.0)
-        heat = self._slots.fill(over_k * (0.0 if view.last is None else view.step_h))
-        return dict.fromkeys(groups, heat)
+        heat = self.slots["crac"].fill(over_k * (0.0 if view.last is None else view.step_h))
+        return {"crac": heat}
 
     def start_info(self) -> dict[str, npt.NDArray[Any]]:
         """Return the start day and the randomly drawn inputs of the current episodes, (E,) each.

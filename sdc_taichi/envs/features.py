@@ -29,7 +29,7 @@ from sdc_taichi.envs.site_order import cleaner_first
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
-from sdc_taichi.types import F32, F64
+from sdc_taichi.types import CRAC_UNITS, F32, F64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 """Default leads of the forecasts of carbon intensity and price, in h."""
@@ -186,6 +186,8 @@ _TIME: _Kind = {}
 _MEASURED: _Kind = {}
 _OF_VIEW: _Kind = {}
 _OF_UNITS: _Kind = {}
+_OF_AXIS = {CRAC_UNITS: _OF_UNITS}
+"""Features of units by kind of unit."""
 
 
 def _feature(
@@ -237,9 +239,14 @@ def view_features(layout: Layout) -> tuple[Feature, ...]:
     return _features_of(_OF_VIEW, layout)
 
 
-def unit_features(layout: Layout) -> tuple[Feature, ...]:
-    """Return the features of CRAC units: functions of the view, not compiled, (size, U)."""
-    return _features_of(_OF_UNITS, layout)
+def unit_features(layout: Layout, axis: str) -> tuple[Feature, ...]:
+    """Return the features of a kind of units: functions of the view, not compiled, (size, U).
+
+    Args:
+        layout: numbers of entries.
+        axis: kind of units: ``CRAC_UNITS``.
+    """
+    return _features_of(_OF_AXIS[axis], layout)
 
 
 def all_features(layout: Layout = DEFAULT_LAYOUT) -> tuple[Feature, ...]:
@@ -596,7 +603,7 @@ def features_by_agent(
     commands: Mapping[str, Sequence[str]] | None = None,
     *,
     agents: Sequence[str] = AGENTS,
-    of_units: Sequence[Feature] = (),
+    of_units: Mapping[str, Sequence[Feature]] | None = None,
 ) -> dict[str, tuple[Feature, ...]]:
     """Return the features that each agent observes.
 
@@ -608,7 +615,7 @@ def features_by_agent(
         known: all features of data centers.
         commands: commands that agents decide, by agent; None means the default commands.
         agents: names of the agents that observe.
-        of_units: all features of CRAC units, which agents of CRAC units can observe too.
+        of_units: all features of units by kind, which agents of these units can observe too.
 
     Raises:
         ConfigError: an agent or feature is unknown, a feature is named twice, or an agent has no
@@ -622,7 +629,7 @@ def features_by_agent(
             )
     out: dict[str, tuple[Feature, ...]] = {}
     for agent in agents:
-        of_agent = (*known, *of_units) if AGENT_DEFINITIONS[agent].per_unit else known
+        of_agent = (*known, *(of_units or {}).get(AGENT_DEFINITIONS[agent].axis, ()))
         by_name = {feature.name: feature for feature in of_agent}
         acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
         default = [n for n in (*AGENT_DEFINITIONS[agent].features, *acted_on) if n in by_name]
@@ -670,13 +677,16 @@ def entries_of_new_features(
     Args:
         features_of: features of each agent, in the order of its observation. Each feature has a
             ``name`` and a ``size``. Equal objects count as the same feature, except features of
-            CRAC units, and of different sites in names such as ``NY/agent_dc``.
+            units, and of different sites in names such as ``NY/agent_dc``.
     """
     known: set[Any] = set()
     out: dict[str, npt.NDArray[np.int64] | slice] = {}
     for agent, features in features_of.items():
         site = agent.rpartition("/")[0]
-        is_new = [f.name in _OF_UNITS or (site, f) not in known for f in features]
+        is_new = [
+            any(f.name in kind for kind in _OF_AXIS.values()) or (site, f) not in known
+            for f in features
+        ]
         new = np.repeat(is_new, [f.size for f in features])
         entries = np.flatnonzero(new)
         # Indexing with a slice copies nothing, unlike indexing with an array.
@@ -695,7 +705,7 @@ def features_markdown() -> str:
 def group_features_markdown() -> str:
     """Return the Markdown table of the features of ``crac``, ``plant`` and ``agent_geo``."""
     layout = Layout(hall=1, neighbours=1, other_sites=1)
-    of_view = [*view_features(layout), *unit_features(layout)]
+    of_view = [*view_features(layout), *(f for x in _OF_AXIS for f in unit_features(layout, x))]
     return _markdown(of_view, {name: name for name in ALL_AGENTS[len(AGENTS) :]})
 
 

@@ -3,7 +3,7 @@
 Module ``features`` defines how a feature follows from its inputs. The observer computes all
 features once per view, by three methods. Entries that depend on time alone are copied from shared
 rows (``time_rows``). Entries measured in the data center come from one compiled stage. Entries of
-single racks and CRAC units are computed with NumPy.
+single racks and units are computed with NumPy.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.time_rows import Forecasts, TimeRows
-from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.unit_slots import UnitSlots, slots_of_groups
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
@@ -49,7 +49,7 @@ class Observer:
     """Computes the observation of each agent, and the shared state, for a fleet.
 
     Forecasts have the forecast errors of the view. The shared state concatenates all features of
-    the data center and, if agents of CRAC units observe, all features of each unit, unit by unit.
+    the data center and, if agents of units observe, all features of each unit, unit by unit.
 
     Args:
         fleet: the B data centers.
@@ -60,7 +60,8 @@ class Observer:
         new_inputs: True if inputs may differ from episode to episode.
         commands: commands that agents decide, by agent; None means the default commands.
         neighbours: number of neighbouring CRAC units that an agent of a unit observes.
-        slots: places of CRAC units in the observations of their agents; None means as few as fit.
+        slots: places of units in the observations of their agents, by group; None means as few as
+            fit.
 
     Attributes:
         features: features of each agent, in the order of its observation.
@@ -83,7 +84,7 @@ class Observer:
         new_inputs: bool = False,
         commands: Mapping[str, Sequence[str]] | None = None,
         neighbours: int = 0,
-        slots: UnitSlots | None = None,
+        slots: Mapping[str, UnitSlots] | None = None,
     ) -> None:
         forecasts = Forecasts(
             fleet.steps_per_hour, ci_leads_h=ci_leads_h, weather_leads_h=weather_leads_h
@@ -107,11 +108,14 @@ class Observer:
         of_time, self._measured = time_features(layout), measured_features(layout)
         self._of_view = view_features(layout)
         self.state_features = all_features(layout)
-        self._of_units = unit_features(layout) if of_units else ()
-        self._slots = UnitSlots(fleet) if slots is None else slots
-        self.state_space = features_space(
-            (*self.state_features, *self._slots.width * self._of_units)
-        )
+        self._slots = slots_of_groups(fleet, agents) if slots is None else slots
+        # Groups of one kind of unit share slots and features.
+        self._slots_of_axis = {AGENT_DEFINITIONS[a].axis: self._slots[a] for a in of_units}
+        self._of_units = {axis: unit_features(layout, axis) for axis in self._slots_of_axis}
+        by_slot = [
+            f for axis, x in self._slots_of_axis.items() for f in x.width * self._of_units[axis]
+        ]
+        self.state_space = features_space((*self.state_features, *by_slot))
         self.features = features_by_agent(
             features, self.state_features, commands, agents=agents, of_units=self._of_units
         )
@@ -128,7 +132,7 @@ class Observer:
             for agent in agents
         }
         self._in_observation = {a: _entries_of_units(self.features[a], slices) for a in of_units}
-        self._unit_slices = feature_slices(self._of_units)
+        self._unit_slices = {axis: feature_slices(x) for axis, x in self._of_units.items()}
         # Measured entries first receive an arbitrary time entry, which ``observe`` overwrites.
         from_rows = {a: np.where(c < self._time_width, c, 0) for a, c in columns.items()}
         self._runs = {agent: _runs(c - self._time_width) for agent, c in columns.items()}
@@ -160,7 +164,7 @@ class Observer:
     def observe(self, view: View) -> dict[str, F32]:
         """Return the observation of each agent before the coming step, (B, n) each.
 
-        Those of agents of CRAC units are (B, W, n), with the slots of ``UnitSlots``.
+        Those of agents of units are (B, W, n), with the slots of ``UnitSlots``.
 
         ``reset`` must have been called.
         """
@@ -171,14 +175,11 @@ class Observer:
             for places, source in runs:
                 out[:, places] = entries.measured[source].T
         for agent, columns in self._in_observation.items():
-            of_dc, features = observations[agent], self.features[agent]
-            out = np.empty((*self._slots.exists.shape, len(columns)), dtype=np.float32)
+            of_dc, axis = observations[agent], AGENT_DEFINITIONS[agent].axis
+            slices, of_units = self._unit_slices[axis], entries.of_units[axis]
+            out = np.empty((*self._slots[agent].exists.shape, len(columns)), dtype=np.float32)
             out[..., ~columns] = of_dc[:, None]
-            chosen = [
-                entries.of_units[self._unit_slices[f.name]]
-                for f in features
-                if f.name in self._unit_slices
-            ]
+            chosen = [of_units[slices[f.name]] for f in self.features[agent] if f.name in slices]
             out[..., columns] = np.moveaxis(np.concatenate(chosen), 0, -1)
             observations[agent] = out
         return observations
@@ -193,8 +194,9 @@ class Observer:
         out = np.empty((view.size, *(self.state_space.shape or ())), dtype=np.float32)
         out[:, :width] = entries.time.take(entries.row_numbers, axis=0)
         out[:, width:end] = entries.measured.T
-        if self._of_units:
-            out[:, end:] = np.moveaxis(entries.of_units, 0, -1).reshape(view.size, -1)
+        by_slot = [np.moveaxis(x, 0, -1).reshape(view.size, -1) for x in entries.of_units.values()]
+        if by_slot:
+            out[:, end:] = np.concatenate(by_slot, axis=1)
         return out
 
     def _entries_of(self, view: View) -> _Entries:
@@ -204,12 +206,16 @@ class Observer:
             self._entries = _Entries(view, *self._time.rows(view), measured, of_units)
         return self._entries
 
-    def _measure_units(self, view: View) -> F32:
-        """Compute the scaled entries of all features of CRAC units, (m, B, W)."""
-        rows = [scale(f.value(view)[: f.size].astype(np.float32), f) for f in self._of_units]
-        if not rows:
-            return np.zeros((0, 0, 0), dtype=np.float32)
-        return self._slots.fill(np.concatenate(rows))
+    def _measure_units(self, view: View) -> dict[str, F32]:
+        """Compute the scaled entries of all features of units, by kind of unit, (m, B, W) each."""
+        return {
+            axis: self._slots_of_axis[axis].fill(
+                np.concatenate(
+                    [scale(f.value(view)[: f.size].astype(np.float32), f) for f in features]
+                )
+            )
+            for axis, features in self._of_units.items()
+        }
 
     def _measure(self, view: View) -> F32:
         """Compute the scaled entries measured in the data center, (m, B), a contiguous row each."""
@@ -275,8 +281,8 @@ class _Entries(NamedTuple):
     """Index into ``time`` of the row of each data center, (B,)."""
     measured: F32
     """Entries that do not depend on time alone, (m, B)."""
-    of_units: F32
-    """Entries of CRAC units, (m, B, W); empty if no agent of a CRAC unit observes."""
+    of_units: dict[str, F32]
+    """Entries of units, by kind of unit of which agents observe, (m, B, W) each."""
 
 
 class _AtRest:
@@ -297,7 +303,7 @@ def make_observer(
     options: EnvOptions,
     *,
     new_inputs: bool = False,
-    slots: UnitSlots | None = None,
+    slots: Mapping[str, UnitSlots] | None = None,
 ) -> Observer | ReleasedObserver:
     """Create the observer of the agents that learn.
 
@@ -305,7 +311,7 @@ def make_observer(
         fleet: the data centers.
         options: environment options, among them features and leads.
         new_inputs: True if inputs may differ from episode to episode.
-        slots: places of CRAC units in observations; None means as few as fit.
+        slots: places of units in observations, by group; None means as few as fit.
 
     Raises:
         ConfigError: features or leads do not fit the data centers.
@@ -328,7 +334,7 @@ def make_observer(
 def _entries_of_units(
     features: Sequence[Feature], of_dc: Mapping[str, slice]
 ) -> npt.NDArray[np.bool_]:
-    """Return True for the entries of an observation that belong to features of CRAC units, (n,).
+    """Return True for the entries of an observation that belong to features of units, (n,).
 
     Args:
         features: features of the observation, in order.

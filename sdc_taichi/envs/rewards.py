@@ -23,12 +23,11 @@ from sdc_taichi.envs.agents import (
 )
 from sdc_taichi.envs.released import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
-from sdc_taichi.envs.unit_slots import UnitSlots
+from sdc_taichi.envs.unit_slots import UnitSlots, slots_of_groups
 from sdc_taichi.envs.view_terms import OF_DATA_CENTERS, OF_UNITS, ViewContext
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
-from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
-from sdc_taichi.types import F64, StepResult
+from sdc_taichi.types import CRAC_UNITS, F64, StepResult
 from sdc_taichi.user_functions import (
     checked_values,
     function_named,
@@ -38,8 +37,8 @@ from sdc_taichi.user_functions import (
 
 RewardFunction = Callable[[StepResult, View], Any]
 """Reward function of a user. It takes the result of a step and the view after the step. It returns
-rewards, (B,), for every learning agent, or a dict of rewards by learning group, (B,) each, or (U,)
-for a group with an agent for each CRAC unit."""
+rewards, (B,), for every learning agent, or a dict of rewards by learning group, (B,) each, or one
+for each unit for a group with an agent for each."""
 
 _COUNTED_ONCE = ("default", "bill", "own")
 """Reward sets whose joint reward counts each term once, even if several agents have this term. The
@@ -50,9 +49,11 @@ SCALED_SETS = tuple(name for name in REWARD_SETS if name != "sustaindc")
 """Reward sets that are sums of terms, multiplied by the scales of ``AGENT_DEFINITIONS``."""
 
 _OF_UNITS = {agent for agent, definition in AGENT_DEFINITIONS.items() if definition.per_unit}
-"""Groups with an agent for each CRAC unit."""
+"""Groups with an agent for each unit."""
 VIEW_TERMS = OF_DATA_CENTERS | OF_UNITS
 """Terms that are functions of the view, by name."""
+_OF_AXIS = {CRAC_UNITS: OF_UNITS}
+"""Terms of the agents of units, by kind of unit."""
 MOST_SCALE = 1e9
 """Maximum absolute scale of a term, large enough for prices in any currency."""
 BILLED_SHARE = 0.5
@@ -130,19 +131,22 @@ class Rewards:
         used = {name for scales in self._scales.values() for name in scales}
         self.used_terms = [name for name in TERMS if name in used]
         self._view_terms = [name for name in VIEW_TERMS if name in used]
+        self._has_units = bool(self._view_terms) or not _OF_UNITS.isdisjoint(self._team)
         self._stage: Any = None
         self._context = TermContext(days / BILL_DAYS)
         self._of_view = ViewContext(self._context)
-        self._slots: UnitSlots | None = None
+        # Slots of the agents that learn, and of those of the team.
+        self._slots: Mapping[str, UnitSlots] = {}
+        self._team_slots: Mapping[str, UnitSlots] = {}
         # Highest billed power before and after the last step, in kW, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
 
-    def reset(self, view: View, slots: UnitSlots) -> None:
+    def reset(self, view: View, slots: Mapping[str, UnitSlots]) -> None:
         """Start an episode.
 
         Args:
             view: the view before the first step.
-            slots: places of CRAC units in the rewards of their agents.
+            slots: places of units in the rewards of their agents, by learning group.
 
         Raises:
             DataError: the carbon intensity is constant, so the released code's rewards cannot be
@@ -154,6 +158,7 @@ class Rewards:
             self._of_view.reset(view)
         if slots is not self._slots:
             self._slots, self._stage = slots, None
+            self._team_slots = slots_of_groups(view.fleet, self._team)
         if self._released is not None:
             self._released.reset(view)
 
@@ -193,23 +198,24 @@ class Rewards:
             self._context.begin_step(result.step, self._peak_before_kw)
             by_agent: dict[str, F64] = self._stage(context=self._context, result=result)
             self._peak_kw = by_agent.pop("peak_kw")
-            if self._view_terms:
-                return self._with_view_terms(by_agent, result, view)
+            if self._has_units:
+                return self._with_units(by_agent, result, view)
             return by_agent, by_agent.pop("joint")
         self._peak_kw = _peak_kw(self._peak_kw, result)
         if self._function is not None:
             returned = self._function(result, view)
-            assert self._slots is not None
+            slots = self._slots
             if not isinstance(returned, Mapping):
                 for_all = checked_values("rewards function", returned, "all agents", view.size)
-                slots = for_all[:, None] * self._slots.exists
-                by_agent = {a: slots if a in _OF_UNITS else for_all for a in self._agents}
+                by_agent = {
+                    a: for_all[:, None] * slots[a].exists if a in slots else for_all
+                    for a in self._agents
+                }
                 return by_agent, for_all
-            by_agent = _checked_by_agent(returned, self._agents, view.fleet)
-            joint = _sum([_mean_of_units(x, view.fleet) for x in by_agent.values()])
-            return {
-                a: self._slots.fill(x) if a in _OF_UNITS else x for a, x in by_agent.items()
-            }, joint
+            sizes = {a: slots[a].count if a in slots else view.size for a in self._agents}
+            by_agent = _checked_by_agent(returned, sizes)
+            joint = _sum([slots[a].means(x) if a in slots else x for a, x in by_agent.items()])
+            return {a: slots[a].fill(x) if a in slots else x for a, x in by_agent.items()}, joint
         assert self._released is not None
         return _with_sum(self._shared([*self._released.rewards(result, view).values()]))
 
@@ -229,12 +235,12 @@ class Rewards:
     def _stage_function(self, context: Any, result: Any) -> dict[str, F64]:
         """Compute rewards by agent, the joint reward and the peak power of a step, (B,) each.
 
-        With terms of the view, the rewards are the individual ones, without those terms.
+        With terms of the view or units, the rewards are the individual ones, without those terms.
         ``CompiledStage`` traces this function.
         """
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
         peak_kw = {"peak_kw": _peak_kw(context.peak_kw, result)}
-        if self._view_terms:
+        if self._has_units:
             general = {
                 agent: {name: x for name, x in self._scales[agent].items() if name in terms}
                 for agent in self._team
@@ -255,12 +261,12 @@ class Rewards:
         by_agent = dict(zip(self._team, shared, strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
 
-    def _with_view_terms(
+    def _with_units(
         self, by_agent: dict[str, F64], result: StepResult, view: View
     ) -> tuple[dict[str, F64], F64]:
-        """Return rewards and joint reward of a team with terms of the view.
+        """Return rewards and joint reward of a team with terms of the view, or with units.
 
-        Each agent of a CRAC unit counts as one agent of the team.
+        Each agent of a unit counts as one agent of the team.
 
         Args:
             by_agent: individual rewards by group, and part of the joint reward that counts each
@@ -268,40 +274,53 @@ class Rewards:
             result: result of the step.
             view: the view after the step.
         """
-        fleet, slots = view.fleet, self._slots
-        assert slots is not None
+        slots = self._team_slots
         joint = by_agent.pop("joint", np.zeros(view.size))
         terms = {n: VIEW_TERMS[n](result, view, self._of_view) for n in self._view_terms}
         individual: dict[str, F64] = {}
         for agent in self._team:
             scales = {n: x for n, x in self._scales[agent].items() if n in terms}
-            value = np.zeros(fleet.units if agent in _OF_UNITS else view.size)
+            units = slots.get(agent)
+            value = np.zeros(view.size if units is None else units.count)
             for name, scale in scales.items():
                 term = terms[name]
-                if agent in _OF_UNITS and name not in OF_UNITS:
-                    term = term[fleet.unit_dc]
+                if units is not None and name in OF_DATA_CENTERS:
+                    term = term[units.dc]
                 value = value + scale * term
-            individual[agent] = value + by_agent.get(agent, 0.0)
-        number = {a: np.diff(fleet.unit_offsets) for a in self._team if a in _OF_UNITS}
-        sums = {a: fleet.unit_sums(x) if a in _OF_UNITS else x for a, x in individual.items()}
+            general = by_agent.get(agent)
+            if general is not None:
+                value = value + (general if units is None else general[units.dc])
+            individual[agent] = value
+        sums = {a: slots[a].sums(x) if a in slots else x for a, x in individual.items()}
         total = _sum(list(sums.values()))
-        others = _sum([number.get(a, np.ones(view.size)) for a in self._team]) - 1.0
-        own = self._collaboration
+        counts: dict[str, Any] = {a: x.counts for a, x in slots.items()}
+        others = _sum([counts.get(a, np.ones(view.size)) for a in self._team]) - 1.0
+        own = np.where(others > 0.0, self._collaboration, 1.0)
         weight = (1.0 - own) / np.maximum(others, 1.0)
         rewards: dict[str, F64] = {}
         for agent in self._agents:
             value = individual[agent]
-            if agent in _OF_UNITS:
-                dc = fleet.unit_dc
-                rewards[agent] = slots.fill(own * value + weight[dc] * (total[dc] - value))
+            if agent in slots:
+                dc = slots[agent].dc
+                rewards[agent] = self._slots[agent].fill(
+                    own[dc] * value + weight[dc] * (total[dc] - value)
+                )
             else:
                 rewards[agent] = own * value + weight * (total - value)
         if not self._joint_scales:
-            return rewards, _sum([sums[a] / number.get(a, 1.0) for a in self._agents])
+            return rewards, _sum([sums[a] / counts.get(a, 1.0) for a in self._agents])
         for name, scale in self._joint_scales.items():
             if name in terms:
-                joint = joint + scale * _mean_of_units(terms[name], fleet)
+                joint = joint + scale * self._of_dcs(name, terms[name])
         return rewards, joint
+
+    def _of_dcs(self, name: str, term: F64) -> F64:
+        """Return a term of data centers, (B,), or the mean of one of units over each of them."""
+        axis = next((axis for axis, names in _OF_AXIS.items() if name in names), None)
+        if axis is None:
+            return term
+        group = next(a for a in self._team_slots if AGENT_DEFINITIONS[a].axis == axis)
+        return self._team_slots[group].means(term)
 
 
 def team_of(agents: Sequence[str]) -> tuple[str, ...]:
@@ -332,6 +351,8 @@ def collaborative_rewards(individual: Sequence[F64], a: float) -> list[F64]:
     Returns:
         R_i of each agent, (B,) each.
     """
+    if len(individual) == 1:
+        return list(individual)
     total, weight = _sum(individual), (1.0 - a) / (len(individual) - 1)
     return [a * reward + weight * (total - reward) for reward in individual]
 
@@ -367,7 +388,8 @@ def _checked_scales(
             raise ConfigError(f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, team)}")
         if not isinstance(scales, Mapping):
             raise ConfigError(f"rewards of {agent}: {scales!r}; valid is a dict of term to scale")
-        valid = [*OF_UNITS, *OF_DATA_CENTERS] if agent in _OF_UNITS else [*TERMS, *OF_DATA_CENTERS]
+        of_units = _OF_AXIS.get(AGENT_DEFINITIONS[agent].axis, {})
+        valid = [*of_units, *OF_DATA_CENTERS, *TERMS]
         for name, scale in scales.items():
             if name not in valid:
                 raise ConfigError(
@@ -396,37 +418,25 @@ def _function_named(name: Any) -> RewardFunction:
     return function
 
 
-def _checked_by_agent(
-    returned: Mapping[Any, Any], agents: Sequence[str], fleet: Fleet
-) -> dict[str, F64]:
+def _checked_by_agent(returned: Mapping[Any, Any], sizes: Mapping[str, int]) -> dict[str, F64]:
     """Check the dict that a user's function returned; return rewards by learning group.
 
-    They are (B,), or (U,) for a group with an agent for each CRAC unit.
+    Args:
+        returned: rewards by group.
+        sizes: number of rewards of each learning group: of data centers, or of units.
     """
     for agent in returned:
         if agent not in ALL_AGENTS:
             raise SdcError(
                 f"rewards function: unknown agent {agent!r}{suggestion_or_valid(agent, ALL_AGENTS)}"
             )
-    for agent in agents:
+    for agent in sizes:
         if agent not in returned:
             raise SdcError(f"rewards function: returned none for {agent}")
     return {
-        agent: checked_values(
-            "rewards function",
-            returned[agent],
-            agent,
-            fleet.units if agent in _OF_UNITS else fleet.size,
-        )
-        for agent in agents
+        agent: checked_values("rewards function", returned[agent], agent, size)
+        for agent, size in sizes.items()
     }
-
-
-def _mean_of_units(values: F64, fleet: Fleet) -> F64:
-    """Return the mean over the units of each data center, (B,); values of data centers stay."""
-    if len(values) == fleet.size:
-        return values
-    return np.asarray(fleet.unit_sums(values) / np.diff(fleet.unit_offsets))
 
 
 def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:

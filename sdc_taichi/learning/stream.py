@@ -25,7 +25,6 @@ from sdc_taichi.envs.agents import AGENT_DEFINITIONS, Agent
 from sdc_taichi.envs.core import Observation, Transition
 from sdc_taichi.envs.episodes import draws_inputs
 from sdc_taichi.envs.single import JointLearner
-from sdc_taichi.envs.unit_slots import UnitSlots
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.policy import CHOICES, action_levels
@@ -52,7 +51,7 @@ class LearnerSpaces:
     count: int = 1
     """Number W of agents in each environment that share the policy."""
     has_mask: bool = False
-    """True for agents of CRAC units, which are without effect while their units are down."""
+    """True for agents of units, which are without effect while their units are down."""
 
 
 class StreamStep(NamedTuple):
@@ -103,7 +102,7 @@ class EnvironmentStream:
 
     Attributes:
         learners: names of the learners.
-        own_policies: groups of CRAC units whose agents do not share a policy.
+        own_policies: groups of units whose agents do not share a policy.
         spaces: sizes of the observations and actions of each learner.
         state_width: number m of entries of the shared state; 0 without a shared state.
         size: number of environments, B.
@@ -154,7 +153,6 @@ class EnvironmentStream:
             members = tuple(agent for names in core.members.values() for agent in names)
             of_joint = self._joint.observation_space, self._joint.action_space
             self.spaces[JOINT] = _learner_spaces(members, *of_joint, levels)
-        self._slots = UnitSlots(core.sim.fleet)
         for group, names in {} if joint else core.members.items():
             of_group = core.observation_spaces[group], core.action_spaces[group], levels
             own = group in self.own_policies
@@ -236,7 +234,7 @@ class EnvironmentStream:
     def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return actions by group as arrays; (B,) for a single discrete action, else (B, k).
 
-        Those of agents of CRAC units have the units as second axis.
+        Those of agents of units have the units as second axis.
         """
         levels = self._levels
         arrays = {
@@ -274,7 +272,8 @@ class EnvironmentStream:
         if self.spaces[name].count == 1:
             return rewards
         by_agent = rewards.reshape(self.size, -1)
-        exists = self._slots.exists if self.spaces[name].has_mask else np.ones_like(by_agent)
+        slots = self._core.slots.get(name)
+        exists = np.ones_like(by_agent) if slots is None else slots.exists
         return np.asarray((by_agent * exists).sum(axis=1) / exists.sum(axis=1))
 
     def _rewards(self, transition: Transition) -> _Rewards:
