@@ -2,8 +2,9 @@
 
 In shapes, B is the number of data centers. U, R, G and S are the numbers of CRAC units, racks,
 server groups and servers of all data centers together, concatenated in the order of the data
-centers. Dataclasses that are created in every step are not frozen, because creating a frozen one
-takes three times as long.
+centers; C, M and L are those of coolant distribution units (CDUs), of their secondary loops
+(manifolds), and of liquid-cooled racks. Dataclasses that are created in every step are not frozen,
+because creating a frozen one takes three times as long.
 """
 
 from __future__ import annotations
@@ -124,6 +125,21 @@ class Actions:
     (column), (B, S), S being ``Fleet.sites_per_fleet``. Values are limited to 0..1 and the sum of a
     row to 1; a site's own column counts as 0. What links and rooms do not allow stays. None sends
     nothing."""
+    cdu_setpoint_c: float | F64 | None = None
+    """Wanted temperature of the coolant that each CDU sends to its racks, in C, 20..45, shape (),
+    (B,) or (C,). The setpoint approaches it by up to 2 K a step; None holds the setpoint."""
+    cdu_flow: float | F64 | None = None
+    """Flow of each CDU divided by its design flow, 0.4..1.1, shape (), (B,) or (C,); None holds
+    it."""
+    facility_approach_k: float | F64 | None = None
+    """Lowest supply setpoint of the CDUs minus setpoint of the facility water, in K, 2..15, shape
+    () or (B,); None means ``liquid.cdus.approach_k``."""
+    reuse_share: float | F64 | None = None
+    """Share of the facility water's heat that may be reused, 0..1, shape () or (B,); None means
+    ``liquid.reuse.share``."""
+    power_cap: float | F64 | None = None
+    """Power cap of the GPUs of liquid-cooled racks divided by their highest power, 0.5..1, shape ()
+    or (B,); None means 1."""
 
 
 @dataclass(slots=True)
@@ -200,10 +216,29 @@ class State:
     tank_heat_j: F64
     """Heat stored in a stratified tank relative to water at its setpoint, in J, (B,); only in
     transient halls."""
+    cdu_setpoint_c: F64
+    """Supply setpoint of each CDU, in C, (C,)."""
+    cdu_flow: F64
+    """Commanded flow of each CDU divided by its design flow, (C,)."""
+    junction_c: F64
+    """Junction temperature of the GPUs of each liquid-cooled rack, in C, (L,); only in transient
+    halls."""
+    manifold_return_c: F64
+    """Temperature of the coolant that returns from the racks of each manifold, in C, (M,); only in
+    transient halls."""
+    manifold_supply_c: F64
+    """Temperature of the coolant at the racks of each manifold, in C, (M,); only in transient
+    halls."""
+    facility_return_c: F64
+    """Temperature of the facility water that returns from the CDUs, in C, (B,); only in transient
+    halls with liquid-cooled racks."""
+    facility_supply_c: F64
+    """Temperature of the facility water at the CDUs, in C, (B,); only in transient halls with
+    liquid-cooled racks."""
 
 
-DATA_CENTERS, CRAC_UNITS, RACKS = "B", "U", "R"
-"""Axis of a quantity: one entry per data center (B), CRAC unit (U) or rack (R)."""
+DATA_CENTERS, CRAC_UNITS, RACKS, CDUS = "B", "U", "R", "C"
+"""Axis of a quantity: one entry per data center (B), CRAC unit (U), rack (R) or CDU (C)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +252,7 @@ class Quantity:
     unit: str
     """Unit; "1" for shares and ratios, "" for counts, indices and status codes."""
     axis: str = DATA_CENTERS
-    """Kind of element along the array's single axis: data centers, CRAC units or racks."""
+    """Kind of element along the array's single axis: data centers, CRAC units, racks or CDUs."""
 
 
 @dataclass
@@ -381,6 +416,71 @@ class HallQuantities:
     rack_outlet_max_c: Annotated[Reals, Quantity("C", RACKS)]
     """Highest server outlet temperature of each rack; in transient halls the maximum over the
     substeps."""
+
+
+@dataclass
+class LiquidQuantities:
+    """Liquid cooling in one step; 0 for data centers and racks without it."""
+
+    liquid_heat_w: Annotated[F64, Quantity("W")]
+    """Heat of liquid-cooled racks that goes into the coolant."""
+    liquid_air_w: Annotated[F64, Quantity("W")]
+    """Heat of liquid-cooled racks, their lines and pumps that goes into the air of the hall."""
+    junction_max_c: Annotated[F64, Quantity("C")]
+    """Highest junction temperature of GPUs."""
+    cdu_supply_c: Annotated[F64, Quantity("C")]
+    """Temperature of the coolant to the racks, mean over the CDUs weighted by flow."""
+    cdu_return_c: Annotated[F64, Quantity("C")]
+    """Temperature of the coolant from the racks, mean over the manifolds weighted by flow."""
+    facility_supply_c: Annotated[F64, Quantity("C")]
+    """Temperature of the facility water to the CDUs."""
+    facility_return_c: Annotated[F64, Quantity("C")]
+    """Temperature of the facility water from the CDUs."""
+    cdu_pump_w: Annotated[F64, Quantity("W")]
+    """Electric power of the pumps of the CDUs."""
+    facility_pump_w: Annotated[F64, Quantity("W")]
+    """Electric power of the pumps of the facility water."""
+    cooler_fan_w: Annotated[F64, Quantity("W")]
+    """Electric power of the fans that cool the facility water."""
+    trim_chiller_w: Annotated[F64, Quantity("W")]
+    """Electric power of the trim chiller of the facility water."""
+    trim_load_w: Annotated[F64, Quantity("W")]
+    """Heat that the trim chiller removes from the facility water."""
+    heat_pump_w: Annotated[F64, Quantity("W")]
+    """Electric power of the heat pump that reuses heat."""
+    reuse_w: Annotated[F64, Quantity("W")]
+    """Heat that is delivered for reuse, with that of the heat pump's power."""
+    liquid_rejected_w: Annotated[F64, Quantity("W")]
+    """Heat of the facility water and of its trim chiller that is rejected to the outdoors."""
+    liquid_stored_w: Annotated[F64, Quantity("W")]
+    """Rate at which chips and loops store heat; only in transient halls."""
+    cooler_water_l: Annotated[F64, Quantity("l")]
+    """Water that the cooler of the facility water evaporates and drains; part of ``water_l``."""
+    leak_l: Annotated[F64, Quantity("l")]
+    """Coolant lost by leaks; part of ``water_l``."""
+    throttled_tasks: Annotated[F64, Quantity("tasks")]
+    """Started work that GPUs at their temperature limit or power cap did not complete; it waits in
+    the queue again."""
+    heat_income: Annotated[F64, Quantity("currency")]
+    """Income from delivered heat, in the currency of the tariff."""
+    throttle_s: Annotated[F64, Quantity("s")]
+    """Time from the start of the step until a GPU first reaches its temperature limit; -1 if none
+    does."""
+    trip_s: Annotated[F64, Quantity("s")]
+    """Time from the start of the step until a liquid-cooled rack first switches off; -1 if none
+    does."""
+    cdu_supply_each_c: Annotated[F64, Quantity("C", CDUS)]
+    """Temperature of the coolant that each CDU sends to its racks."""
+    cdu_flow_m3s: Annotated[F64, Quantity("m3/s", CDUS)]
+    """Flow of coolant through each CDU."""
+    cdu_heat_w: Annotated[F64, Quantity("W", CDUS)]
+    """Heat that each CDU transfers to the facility water."""
+    cdu_valve: Annotated[F64, Quantity("1", CDUS)]
+    """Flow of facility water through each CDU, divided by its design flow."""
+    rack_junction_c: Annotated[F64, Quantity("C", RACKS)]
+    """Junction temperature of the GPUs of each rack; 0 for air-cooled racks."""
+    rack_liquid_w: Annotated[F64, Quantity("W", RACKS)]
+    """Heat of each rack that goes into the coolant; 0 for air-cooled racks."""
 
 
 @dataclass
@@ -582,6 +682,7 @@ class StepResult(
     PlantQuantities,
     AirIndices,
     CracQuantities,
+    LiquidQuantities,
     HallQuantities,
     SetpointQuantities,
     QueueQuantities,
@@ -619,6 +720,37 @@ class StepResult(
         return self.it_kwh + self.overhead_w * self.step_h / 1e3
 
     @property
+    def reuse_kwh(self) -> F64:
+        """Heat delivered for reuse in the step, in kWh, (B,)."""
+        return self.reuse_w * self.step_h / 1e3
+
+    @property
+    def erf(self) -> F64:
+        """Energy reuse factor (ERF), delivered heat / facility energy, (B,); 0 without energy."""
+        return _ratio(self.reuse_w, self.it_w + self.overhead_w, 0.0)
+
+    @property
+    def ere(self) -> F64:
+        """Energy reuse effectiveness (ERE), (facility - delivered heat) / IT, (B,).
+
+        It is inf without IT power.
+        """
+        return _ratio(self.it_w + self.overhead_w - self.reuse_w, self.it_w, np.inf)
+
+    @property
+    def wue(self) -> F64:
+        """Water usage effectiveness (WUE), make-up water / IT energy, in l/kWh, (B,).
+
+        It is inf without IT power.
+        """
+        return _ratio(self.water_l, self.it_kwh, np.inf)
+
+    @property
+    def liquid_share(self) -> F64:
+        """Share of the IT power whose heat goes into coolant, (B,); 0 without IT power."""
+        return _ratio(self.liquid_heat_w, self.it_w, 0.0)
+
+    @property
     def rhi(self) -> F64:
         """Return heat index (RHI), 1 - SHI, (B,)."""
         return 1.0 - self.shi
@@ -626,12 +758,26 @@ class StepResult(
     @property
     def pue(self) -> F64:
         """Power usage effectiveness, (IT + overhead) / IT, (B,); inf without IT power."""
-        has_it = self.it_w > 0
-        return np.where(has_it, 1.0 + self.overhead_w / np.where(has_it, self.it_w, 1.0), np.inf)
+        return 1.0 + _ratio(self.overhead_w, self.it_w, np.inf)
+
+    @property
+    def tue(self) -> F64:
+        """Total usage effectiveness (TUE), (IT + overhead) / (IT - server fans), (B,).
+
+        Losses in the power supplies of servers are not known and count as used. It is inf without
+        IT power.
+        """
+        return _ratio(self.it_w + self.overhead_w, self.it_w - self.it_fan_w, np.inf)
 
     def per_dc(self) -> dict[str, F64]:
         """Return all quantities of shape (B,) by name, in the order of ``QUANTITIES``."""
         return dict(zip(QUANTITIES_PER_DC, _values_per_dc(self), strict=True))
+
+
+def _ratio(part: F64, whole: F64, otherwise: float) -> F64:
+    """Return ``part`` divided by ``whole``, or ``otherwise`` where ``whole`` is not positive."""
+    has_any = whole > 0
+    return np.where(has_any, part / np.where(has_any, whole, 1.0), otherwise)
 
 
 QUANTITIES: dict[str, Quantity] = {

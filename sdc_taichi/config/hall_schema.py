@@ -28,6 +28,7 @@ from sdc_taichi.config.fields import (
     WorkingShare,
     check_one_per_rack,
 )
+from sdc_taichi.config.liquid_schema import LiquidRack, with_model
 from sdc_taichi.errors import shortened, suggestion_or_valid
 from sdc_taichi.plant.servers import Knee, ServerCurves, curve_through, linear_curve
 
@@ -230,15 +231,50 @@ class ServerGroup(Section):
 
 
 class RackType(Section):
-    """Type of rack, defined by its servers."""
+    """Type of rack, defined by its servers in air, or by its liquid-cooled chips."""
 
-    servers: Annotated[tuple[ServerGroup, ...], Field(min_length=1)]
-    """Server groups of the rack, from the floor up."""
+    model: Name | None = None
+    """Name of a rack of the library (``configs/racks.yaml``), whose values hold for all fields
+    that are not set; None means no such rack."""
+    servers: Annotated[tuple[ServerGroup, ...], Field(min_length=1)] | None = None
+    """Server groups of an air-cooled rack, from the floor up."""
+    liquid: LiquidRack | None = None
+    """Chips and cold plates of a liquid-cooled rack, as an alternative to ``servers``."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed_by_its_model(cls, values: Any) -> Any:
+        return with_model(values)
 
     @field_validator("servers", mode="before")
     @classmethod
     def _one_group_is_a_list_of_one(cls, value: Any) -> Any:
         return [value] if isinstance(value, dict | ServerGroup) else value
+
+    @model_validator(mode="after")
+    def _is_of_one_kind(self) -> Self:
+        if (self.servers is None) == (self.liquid is None):
+            number = "neither is" if self.servers is None else "both are"
+            raise ValueError(f"servers and liquid: {number} given; valid is one of them")
+        return self
+
+    @property
+    def air_servers(self) -> tuple[ServerGroup, ...]:
+        """Server groups whose heat goes to the air.
+
+        A liquid-cooled rack has equal trays with the heat that its liquid leaves.
+        """
+        if (rack := self.liquid) is None:
+            assert self.servers is not None
+            return self.servers
+        tray = ServerGroup(
+            count=rack.trays,
+            full_w=max(rack.air_w(1.0) / rack.trays, 1.0),
+            idle_w=min(rack.air_w(0.0), rack.air_w(1.0)) / rack.trays,
+            design_rise_k=rack.air_rise_k,
+            fan_w=0.0,
+        )
+        return (tray,)
 
 
 class RackRange(Section):

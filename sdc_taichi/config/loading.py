@@ -45,7 +45,8 @@ _REPLACES: dict[str, dict[str, Any]] = {
 def preset_names() -> list[str]:
     """Return the names of the presets that are part of the package."""
     folder = resources.files("sdc_taichi.configs")
-    return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    names = {entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".yaml")}
+    return sorted(names - {"racks"})
 
 
 def load_config(
@@ -301,6 +302,9 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
     if isinstance(node, list):
         node[_list_index(node, last, override)] = value
     else:
+        if sections[:2] == ["hall", "rack_types"] and last == "model":
+            # Values of the present model must not replace those of the new one.
+            node.clear()
         node[last] = value
         if len(sections) == 1:
             _replace_excluded(values, {sections[0]: {last: value}})

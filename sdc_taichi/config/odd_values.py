@@ -111,12 +111,12 @@ def _odd_servers(config: DataCenterConfig) -> Iterator[str]:
     servers, types = config.servers, config.hall.rack_types
     listed_w, field = [full_w for full_w, _ in servers.power_pairs], "servers.power_w"
     if types:
-        listed_w = [group.full_w for rack in types.values() for group in rack.servers]
+        listed_w = [group.full_w for rack in types.values() for group in rack.servers or ()]
         field = "hall.rack_types"
     elif servers.groups is not None:
         listed_w = [group.full_w for rack in servers.groups for group in rack]
         field = "servers.groups"
-    least_w = min(listed_w)
+    least_w = min(listed_w, default=np.inf)
     if least_w < LEAST_USUAL_SERVER_W:
         yield f"{field}: a server of {least_w:g} W at full load; power is in W, not in kW"
     rack_w = config.rack_nameplate_w()

@@ -39,6 +39,7 @@ from sdc_taichi.config.hall_schema import (
     ServerGroup,
 )
 from sdc_taichi.config.hvac_schema import HvacConfig
+from sdc_taichi.config.liquid_schema import LiquidConfig, LiquidRack
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import YEARS, day_of_year
 from sdc_taichi.plant.battery import BATTERIES
@@ -263,6 +264,8 @@ class DataCenterConfig(Section):
     """Power and airflow of the servers."""
     hvac: HvacConfig = HvacConfig()
     """Cooling from the CRAC units to the tower."""
+    liquid: LiquidConfig | None = None
+    """Liquid cooling of racks whose type has ``liquid``; None without such racks."""
     battery: BatteryConfig = BatteryConfig()
     """Battery between grid and facility."""
     electrical: ElectricalConfig = ElectricalConfig()
@@ -354,6 +357,37 @@ class DataCenterConfig(Section):
                     f"hvac.crac.unit_shares of rack {rack}: {len(shares)} entries that sum to "
                     f"{sum(shares):g}; valid is {crac.units} (hvac.crac.units) that sum to 1"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _liquid_fits_the_racks(self) -> Self:
+        names = [name for name, kind in self.hall.rack_types.items() if kind.liquid is not None]
+        racks = len(self.liquid_racks())
+        if self.liquid is None:
+            if racks:
+                raise ValueError(
+                    f"hall.rack_types.{names[0]} is liquid-cooled, but section liquid is missing; "
+                    "valid is a section such as liquid: {setpoint_c: 40}"
+                )
+            return self
+        if not racks:
+            raise ValueError(
+                "liquid is given, but no rack is liquid-cooled; valid is null, or a type of "
+                "hall.rack_types with liquid or model gb200_nvl72"
+            )
+        if self.liquid.cdus.manifolds > racks:
+            raise ValueError(
+                f"liquid.cdus.manifolds {self.liquid.cdus.manifolds}: valid is 1..{racks}, one for "
+                "each liquid-cooled rack"
+            )
+        needs = {
+            "hall.inlet_model recirculation": self.hall.inlet_model == "recirculation",
+            "hall.capacity_mw null": self.hall.capacity_mw is None,
+            "hvac.sizing.model design_day": self.hvac.sizing.model == "design_day",
+        }
+        for condition, is_met in needs.items():
+            if not is_met:
+                raise ValueError(f"liquid-cooled racks need {condition}")
         return self
 
     @model_validator(mode="after")
@@ -489,16 +523,27 @@ class DataCenterConfig(Section):
             return rack_w
         return np.asarray(rack_w * (self.hall.capacity_mw * 1e6 / rack_w.sum()))
 
+    def liquid_racks(self) -> dict[int, LiquidRack]:
+        """Return the liquid-cooled racks by their index in the hall."""
+        types = self.hall.rack_types
+        if all(kind.liquid is None for kind in types.values()):
+            return {}
+        kinds = {name: kind.liquid for name, kind in types.items()}
+        of_racks = enumerate(kinds[name] for name in self.hall.rack_type_names())
+        return {rack: liquid for rack, liquid in of_racks if liquid is not None}
+
     def _given_groups(self) -> dict[str, tuple[ServerGroup, ...]]:
         """Return all configured server groups by the path of their field."""
-        types = {f"hall.rack_types.{k}": v.servers for k, v in self.hall.rack_types.items()}
+        types = {f"hall.rack_types.{k}": v.air_servers for k, v in self.hall.rack_types.items()}
         racks = {f"servers.groups rack {i}": r for i, r in enumerate(self.servers.groups or ())}
         return types | racks
 
     def _listed_groups(self) -> tuple[tuple[ServerGroup, ...], ...] | None:
         """Return the server groups of every rack, or one entry for all racks, or None."""
         types = self.hall.rack_types
-        return tuple(types[n].servers for n in self.hall.rack_type_names()) or self.servers.groups
+        return (
+            tuple(types[n].air_servers for n in self.hall.rack_type_names()) or self.servers.groups
+        )
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Return the server groups of every rack, with counts scaled to ``hall.capacity_mw``.

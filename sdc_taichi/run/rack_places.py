@@ -354,7 +354,7 @@ def _checked_types(
 
 def _full_kw(config: DataCenterConfig, type_name: str) -> float:
     """Return the power of the servers of a rack type at full load, in kW."""
-    servers = config.hall.rack_types[type_name].servers
+    servers = config.hall.rack_types[type_name].air_servers
     return float(sum(group.count * group.full_w for group in servers)) / 1e3
 
 

@@ -37,6 +37,10 @@ STATE_AXES = {
     **dict.fromkeys(("mixed_c", "exhaust_c", "captured_m3s"), "R"),
     **dict.fromkeys(("need_m3s", "plain_m3s", "following", "supply_excess_k"), "U"),
     **dict.fromkeys(("casing_c", "return_air_c"), "U"),
+    **dict.fromkeys(("cdu_setpoint_c", "cdu_flow"), "C"),
+    **dict.fromkeys(("manifold_return_c", "manifold_supply_c"), "M"),
+    **dict.fromkeys(("facility_return_c", "facility_supply_c"), "B"),
+    "junction_c": "L",
 }
 """First axes of the fields of ``State``, except its seeds and its clock."""
 _HALL_FIELDS = tuple(f.name for f in fields(HallState))
@@ -277,8 +281,9 @@ def with_entries_of(
         source: Object with the replacing values as attributes.
         values: Arrays by name; empty arrays stay empty.
         chosen: True for these data centers, (B,).
-        axes: First axis of each array by name: ``B``, ``U``, ``R`` or ``G`` for entries of data
-            centers, CRAC units, racks or server groups.
+        axes: First axis of each array by name: ``B``, ``U``, ``R``, ``G``, ``C``, ``M`` or ``L``
+            for entries of data centers, CRAC units, racks, server groups, CDUs, manifolds or
+            liquid-cooled racks.
         fleet: The data centers.
     """
     racks = chosen[fleet.rack_dc]
@@ -287,6 +292,9 @@ def with_entries_of(
         "U": chosen[fleet.unit_dc],
         "R": racks,
         "G": np.repeat(racks, np.diff(fleet.group_offsets)),
+        "C": chosen[fleet.cdu_dc],
+        "M": chosen[fleet.manifold_dc],
+        "L": racks[fleet.liquid_racks],
     }
     replaced = dict(values)
     for name, value in values.items():

@@ -150,6 +150,14 @@ class Fleet:
     """Decay of exhaust shares per excess of supply over need, dimensionless, (B,)."""
     own_return: npt.NDArray[np.bool_]
     """True if each CRAC unit draws its own return air, (B,); False with a single unit."""
+    liquid_racks: I32
+    """Index of each liquid-cooled rack among all racks, (L,)."""
+    manifold_offsets: I32
+    """First manifold (secondary coolant loop) of each data center, and the number of manifolds,
+    (B + 1,)."""
+    cdu_offsets: I32
+    """First coolant distribution unit (CDU) of each data center, and the number of CDUs,
+    (B + 1,)."""
     air: HallAir | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
     shared_work: SharedWork | None
@@ -169,6 +177,21 @@ class Fleet:
     def unit_dc(self) -> I32:
         """Index of each CRAC unit's data center, (U,)."""
         return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_offsets))
+
+    @property
+    def cdus(self) -> int:
+        """Number of coolant distribution units (CDUs) of all data centers."""
+        return int(self.cdu_offsets[-1])
+
+    @property
+    def cdu_dc(self) -> I32:
+        """Index of each CDU's data center, (C,)."""
+        return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.cdu_offsets))
+
+    @property
+    def manifold_dc(self) -> I32:
+        """Index of each manifold's data center, (M,)."""
+        return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.manifold_offsets))
 
     @property
     def design_speed(self) -> F64:
@@ -275,6 +298,8 @@ class _HallArrays:
     """Setpoint of the CRAC units minus their coldest supply temperature, in K."""
     air: _Air | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
+    liquid_racks: I32
+    """Index of each liquid-cooled rack, (racks with liquid cooling,)."""
     odd: tuple[str, ...]
     """Warnings about unusual airflows of the hall."""
 
@@ -322,11 +347,13 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     halls = _distinct_halls(listed)
     warn_of([(config.name, hall.odd) for config, hall in zip(listed, halls, strict=True)])
     racks = np.array([len(h.groups_per_rack) for h in halls])
+    rack_offsets = offsets_from_counts(racks, "racks")
+    cdus = [None if config.liquid is None else config.liquid.cdus for config in listed]
     return Fleet(
         configs=listed,
         models=models,
         steps_per_hour=shared["simulation.steps_per_hour"],
-        rack_offsets=offsets_from_counts(racks, "racks"),
+        rack_offsets=rack_offsets,
         rack_dc=np.repeat(np.arange(len(listed), dtype=np.int32), racks),
         group_offsets=offsets_from_counts(
             np.concatenate([h.groups_per_rack for h in halls]), "server groups"
@@ -346,6 +373,15 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         oversupply_decay=np.array([c.oversupply_decay for c in listed]),
         own_return=np.array(
             [c.hvac.crac.draws_own_return and models["inlet"] == "recirculation" for c in listed]
+        ),
+        liquid_racks=np.concatenate(
+            [h.liquid_racks + first for h, first in zip(halls, rack_offsets, strict=False)]
+        ),
+        manifold_offsets=offsets_from_counts(
+            [0 if c is None else c.manifolds for c in cdus], "manifolds"
+        ),
+        cdu_offsets=offsets_from_counts(
+            [0 if c is None else c.manifolds * c.per_manifold for c in cdus], "CDUs"
         ),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
         shared_work=shared_work(listed),
@@ -486,6 +522,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         design_flow_m3s=design.crac_flow_m3s,
         setpoint_over_supply_k=design.setpoint_over_supply_k(config),
         air=air,
+        liquid_racks=np.array([*config.liquid_racks()], dtype=np.int32),
     )
 
 

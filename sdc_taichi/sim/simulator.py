@@ -23,6 +23,7 @@ from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
+from sdc_taichi.sim.liquid_halls import no_liquid_state, without_liquid
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.snapshot import LAST_START
@@ -237,7 +238,7 @@ class Simulator:
             self._last_air = air
         racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
         stage_results = map(vars, (commands, surroundings, transfer, work, supply, air, racks))
-        step = {"step": state.step, "step_h": self.step_h}
+        step = {"step": state.step, "step_h": self.step_h, **without_liquid(self.fleet)}
         result = StepResult(*_values_of_result(joined(step, *stage_results, plant)))
         self._state = _next_state(state, transfer, work, supply, plant, racks, thermal)
         return result
@@ -553,6 +554,7 @@ def _next_state(
         rack_status=racks.rack_status.copy(),
         restart_wait_min=racks.restart_wait_min,
         **thermal,
+        **no_liquid_state(),
     )
 
 

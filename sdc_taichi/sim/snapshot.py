@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.config.liquid_schema import FLOW_LIMITS, SETPOINT_LIMITS_C
 from sdc_taichi.errors import SdcError, shortened
 from sdc_taichi.hall.protection import NORMAL, TRIPPED
 from sdc_taichi.sim.drivers import Drivers, common_digits
@@ -32,6 +33,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "cooling_run": (0, MOST_STEPS),
     "cooling_last": (-MOST_MOVES, MOST_MOVES),
     "fan_speed": (0.0, 1.0),
+    "cdu_setpoint_c": SETPOINT_LIMITS_C,
+    "cdu_flow": FLOW_LIMITS,
     "rack_status": (NORMAL, TRIPPED),
 }
 """Minimum and maximum of fields of ``State``; ``OTHER_LIMITS`` applies to all other fields.
@@ -40,7 +43,7 @@ The limits detect damaged files. A state within the limits from which no physica
 raises a ``PhysicalLimitError`` in the next step."""
 OTHER_LIMITS = (-1e12, 1e12)
 """Minimum and maximum of the fields of ``State`` that ``LIMITS`` does not list."""
-VERSION = 5
+VERSION = 6
 """Version of the snapshot format."""
 
 

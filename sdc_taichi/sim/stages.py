@@ -18,6 +18,7 @@ from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.facility import Facility, FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.liquid_halls import no_liquid_state
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.step_inputs import ActionDecoder, SurroundingsModel, UnitIndex
@@ -83,6 +84,7 @@ class Stages:
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
             restart_wait_min=self.allocation.initial_wait_min(),
             **self.air.initial(supply, demand, rack_load),
+            **no_liquid_state(),
         )
 
 

@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.config.liquid_schema import (
+    APPROACH_LIMITS_K,
+    FLOW_LIMITS,
+    POWER_CAP_LIMITS,
+    SETPOINT_LIMITS_C,
+)
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant.chiller import BOILING_C
 from sdc_taichi.sim.events import Disturbance
@@ -85,6 +92,31 @@ class Commands(CommandQuantities):
     transfer_shares: F64 | None
     """Share of each site's flexible work to send to each site of its fleet, (B, S); None sends
     nothing."""
+    cdu_setpoint_target_c: F64 | None
+    """Wanted supply temperature of each CDU, in C, (C,); None holds the setpoints."""
+    cdu_flow_command: F64 | None
+    """Flow of each CDU divided by its design flow, (C,); None holds it."""
+    facility_approach_k: F64 | None
+    """Lowest supply setpoint of the CDUs minus setpoint of the facility water, in K, (B,); None
+    means the configured one."""
+    reuse_share: F64 | None
+    """Share of the facility water's heat that may be reused, 0..1, (B,); None means the configured
+    one."""
+    power_cap: F64 | None
+    """Power cap of GPUs divided by their highest power, (B,); None means 1."""
+
+
+LIQUID_COMMANDS: dict[str, tuple[str, tuple[float, float]]] = {
+    "cdu_setpoint_c": ("cdu_setpoint_target_c", SETPOINT_LIMITS_C),
+    "cdu_flow": ("cdu_flow_command", FLOW_LIMITS),
+    "facility_approach_k": ("facility_approach_k", APPROACH_LIMITS_K),
+    "reuse_share": ("reuse_share", (0.0, 1.0)),
+    "power_cap": ("power_cap", POWER_CAP_LIMITS),
+}
+"""Field of ``Commands``, lowest and highest value of each action for liquid cooling, by its field
+of ``Actions``."""
+_HELD_LIQUID: dict[str, F64 | None] = {name: None for name, _ in LIQUID_COMMANDS.values()}
+_liquid_actions = attrgetter(*LIQUID_COMMANDS)
 
 
 class ActionDecoder:
@@ -100,6 +132,7 @@ class ActionDecoder:
         self._size, self._n_units = fleet.size, fleet.units
         self._flow_model = fleet.models["crac_flow"]
         self._placement = fleet.models["placement"]
+        self._cdus = fleet.cdus
 
     def decode(self, actions: Actions | None) -> Commands:
         """Convert the actions of one step to commands.
@@ -128,6 +161,7 @@ class ActionDecoder:
             group_weights=self._group_weights(wanted.placement),
             chilled_water_command_c=self._chilled_water_command_c(wanted.chilled_water),
             transfer_shares=self._transfer_shares(wanted.transfer),
+            **self._liquid_commands(wanted),
         )
 
     def _fan_command(self, action: Any) -> F64 | None:
@@ -197,6 +231,33 @@ class ActionDecoder:
             )
         return shares
 
+    def _liquid_commands(self, wanted: Actions) -> dict[str, F64 | None]:
+        """Return the commands for liquid cooling by their fields of ``Commands``, after a check."""
+        actions = _liquid_actions(wanted)
+        if all(action is None for action in actions):
+            return _HELD_LIQUID
+        commands = dict(_HELD_LIQUID)
+        for (name, (field, (low, high))), action in zip(
+            LIQUID_COMMANDS.items(), actions, strict=True
+        ):
+            if action is None:
+                continue
+            if not self._cdus:
+                raise SdcError(
+                    f"action {name}: given, but no rack is liquid-cooled; valid is None, or a "
+                    "config with section liquid"
+                )
+            per_cdu = name in ("cdu_setpoint_c", "cdu_flow")
+            also = self._cdus if per_cdu else None
+            command = self._command(name, action, None, limit=None, also=also)
+            inside = (command >= low) & (command <= high)
+            if not inside.all():
+                raise SdcError(f"action {name}: {command[~inside][0]}; valid is {low:g}..{high:g}")
+            if per_cdu and len(command) != self._cdus:
+                command = command[self._fleet.cdu_dc]
+            commands[field] = command
+        return commands
+
     def _unit_command(self, name: str, action: Any, kind: type[Enum]) -> F64:
         """Return a command for each CRAC unit, (U,), from one for all, per data center or unit."""
         command = self._command(name, action, kind, limit=MOST_MOVES, also=self._n_units)
@@ -208,12 +269,12 @@ class ActionDecoder:
         action: Any,
         kind: type[Enum] | None,
         *,
-        limit: float,
+        limit: float | None,
         also: int | None = None,
     ) -> F64:
         """Return a command for each data center, (B,), or per unit if it has ``also`` entries.
 
-        Every entry is checked to be finite and within -limit..limit.
+        Every entry is checked to be finite and within -limit..limit; None does not check it.
         """
         if isinstance(action, Enum):
             if kind is None or not isinstance(action, kind):
@@ -232,9 +293,8 @@ class ActionDecoder:
             raise SdcError(
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
-        largest = np.maximum.reduce(np.abs(command), axis=None)
         # A comparison with NaN is false, so NaN raises the error as well.
-        if not largest <= limit:
+        if limit is not None and not np.maximum.reduce(np.abs(command), axis=None) <= limit:
             wrong = ~(np.abs(command) <= limit)
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(
