@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.plant.tower import WATER_J_PER_KG_K
 from sdc_taichi.types import F64, Values
 
 Offsets = npt.NDArray[np.int64]
@@ -62,6 +63,8 @@ class RackParameters:
     """Junction temperature to which GPUs limit their power, in C, (L,)."""
     trip_c: Values = 105.0
     """Junction temperature above which the rack switches off, in C, (L,)."""
+    trip_flow_share: Values = 0.4
+    """Flow of coolant below which the rack switches off, as a share of design, (L,)."""
     lpm_per_kw: Values = 1.2
     """Design flow of coolant, in l/min per kW of ``liquid_design_w``, (L,)."""
     liquid_design_w: Values = 115e3
@@ -112,6 +115,10 @@ class CduParameters:
     """Smallest flow of facility water, as a share of design, (C,)."""
     max_valve: Values = 1.2
     """Largest flow of facility water, as a share of design, (C,)."""
+    setpoint_c: Values = 40.0
+    """Supply setpoint before the first step, in C, (C,)."""
+    flow: Values = 1.0
+    """Commanded flow before the first step, as a share of the design flow of the manifold, (C,)."""
 
 
 REUSE_KINDS = ("none", "direct", "heat_pump")
@@ -165,6 +172,10 @@ class PlantParameters:
     """COP of the trim chiller, (B,); nan for the model ``carnot`` of ``plant/chiller.py``."""
     reuse_kind: Values = 0.0
     """Index of the kind of heat reuse in ``REUSE_KINDS``, (B,)."""
+    reuse_share: Values = 0.0
+    """Share of the heat that is offered to the consumer without a command, 0..1, (B,)."""
+    heat_price_per_kwh: Values = 0.0
+    """Price that the consumer pays for heat, per kWh, (B,)."""
     reuse_demand_w: Values = np.inf
     """Largest heat that the consumer takes, in W, (B,)."""
     reuse_effectiveness: Values = 0.8
@@ -177,6 +188,8 @@ class PlantParameters:
     """COP of the heat pump divided by that of a Lorenz process, (B,)."""
     pinch_k: Values = 5.0
     """Temperature difference in each exchanger of the heat pump, in K, (B,)."""
+    substep_s: Values = 15.0
+    """Length of a substep of a transient hall without failures, in s, (B,)."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +250,170 @@ def _items(offsets: Offsets) -> Offsets:
 
 SPARE_CAPACITY = 1.13
 """Capacity of CDUs divided by the design heat of their racks, if none is configured."""
+WATER_KG_M3 = 995.0
+"""Density of facility water, in kg/m3."""
+M3S_PER_LPM = 1.0 / 60000.0
+"""Flow of 1 l/min, in m3/s."""
+COOLER_WALL_SHARE, COOLER_SIDE_SHARE = 0.05, 0.2
+"""Share of the walls in the resistance of a dry cooler, and of the water's film in that of both
+films: most of the resistance is on the side of the air."""
+
+
+def phi(x: Values) -> F64:
+    """Return (1 - exp(-x)) / x, and 1 for x = 0."""
+    x = np.asarray(x, dtype=np.float64)
+    return np.where(x == 0.0, 1.0, -np.expm1(-x) / np.where(x == 0.0, 1.0, x))
+
+
+def effectiveness(ntu: Values, capacity_ratio: Values) -> F64:
+    """Return the effectiveness of a counterflow exchanger (Kays and London).
+
+    With t = NTU phi(NTU (1 - c)) it is t / (1 + c t), which needs no case for c = 1.
+
+    Args:
+        ntu: Number of transfer units: UA divided by the smaller capacity rate.
+        capacity_ratio: Smaller capacity rate divided by the larger one, c.
+    """
+    t = ntu * phi(ntu * (1.0 - np.asarray(capacity_ratio)))
+    return np.asarray(t / (1.0 + capacity_ratio * t))
+
+
+def conductance_w_per_k(ua_w_per_k: Values, c_s: Values, c_f: Values) -> F64:
+    """Return the heat of an exchanger per difference of entering temperatures, in W/K.
+
+    Args:
+        ua_w_per_k: UA, in W/K.
+        c_s: Capacity rate of side s, in W/K.
+        c_f: Capacity rate of side f, in W/K.
+    """
+    low, high = np.minimum(c_s, c_f), np.maximum(c_s, c_f)
+    return np.asarray(low * effectiveness(ua_w_per_k / low, low / high))
+
+
+def ua_share(y_s: Values, y_f: Values, *, wall_share: Values, side_share: Values) -> F64:
+    """Return the UA of an exchanger divided by that at design flows.
+
+    Walls and the films of both sides are in series; films conduct in proportion to flow^(3/4).
+
+    Args:
+        y_s: Flow of side s, as a share of design.
+        y_f: Flow of side f, as a share of design.
+        wall_share: Share of the walls in the resistance at design.
+        side_share: Share of side s in the resistance of both films at design.
+    """
+    films = side_share / np.power(y_s, 0.75) + (1.0 - side_share) / np.power(y_f, 0.75)
+    return np.asarray(1.0 / (wall_share + (1.0 - wall_share) * films))
+
+
+def exchanger_ua_w_per_k(heat_w: Values, c_s: Values, c_f: Values, *, approach_k: Values) -> F64:
+    """Return the UA with which a counterflow exchanger transfers its design heat, in W/K.
+
+    Args:
+        heat_w: Heat at design, in W.
+        c_s: Capacity rate of the side that is cooled, in W/K.
+        c_f: Capacity rate of the other side, in W/K.
+        approach_k: Temperature at which side s leaves minus that at which side f enters, in K.
+    """
+    low, ratio = np.minimum(c_s, c_f), np.minimum(c_s, c_f) / np.maximum(c_s, c_f)
+    share = heat_w / (low * (heat_w / np.asarray(c_s) + approach_k))
+    equal = ratio == 1.0
+    ntu = np.where(
+        equal,
+        share / (1.0 - share),
+        np.log((1.0 - share * ratio) / (1.0 - share)) / np.where(equal, 1.0, 1.0 - ratio),
+    )
+    return np.asarray(ntu * low)
+
+
+def pump_w(head_kpa: Values, flow_m3s: Values, efficiency: Values) -> Values:
+    """Return the power of pumps, in W."""
+    return head_kpa * 1e3 * flow_m3s / efficiency
+
+
+@dataclass(frozen=True)
+class LiquidSizing:
+    """Sizes of CDUs, loops and facility loops of B data centers."""
+
+    rack_m3s: F64
+    """Design flow of coolant of each rack, in m3/s, (L,)."""
+    cdu_w: F64
+    """Capacity of each CDU, in W, (C,)."""
+    cdu_m3s: F64
+    """Design flow of coolant of each CDU, in m3/s, (C,): that of its manifold divided by the number
+    of CDUs that it needs."""
+    cdu_ua_w_per_k: F64
+    """UA of the exchanger of each CDU at design flows, in W/K, (C,)."""
+    cdu_w_per_k: F64
+    """Capacity rate of coolant and of facility water at which the exchanger of each CDU has its UA,
+    in W/K, (C,)."""
+    cdu_pump_w: F64
+    """Power of the pumps of each CDU at design flow, in W, (C,)."""
+    loop_j_per_k: F64
+    """Heat capacity of the coolant of each manifold, in J/K, (M,)."""
+    heat_w: F64
+    """Capacity of the CDUs that are needed, and of the cooler, in W, (B,)."""
+    water_w_per_k: F64
+    """Capacity rate of the facility water at design, in W/K, (B,)."""
+    water_j_per_k: F64
+    """Heat capacity of the facility loop, in J/K, (B,)."""
+    facility_pump_w: F64
+    """Power of the facility pumps at design flow, in W, (B,)."""
+    cooler_ua_w_per_k: F64
+    """UA of the cooler, or of the exchanger of a tower, at design flows, in W/K, (B,)."""
+    fan_w: F64
+    """Power of the cooler's fans at full speed, in W, (B,)."""
+
+
+def _sums(of: Offsets, values: Values, count: int) -> F64:
+    """Return the sum of the values of each of ``count`` parts; ``of`` has the part of each."""
+    return np.bincount(of, np.asarray(values), count).astype(np.float64)
+
+
+def size_liquid(fleet: LiquidFleet) -> LiquidSizing:
+    """Size CDUs, loops, facility pumps and coolers.
+
+    Coolant and facility water of a CDU have equal capacity rates at its capacity and range, as have
+    the water of a cooler and its air. Pumps are sized for the flow of the racks.
+    """
+    racks, cdus, plants = fleet.racks, fleet.cdus, fleet.plants
+    size, loops = len(fleet.manifold_offsets) - 1, len(fleet.rack_offsets) - 1
+    loop_of_rack, loop_of_cdu, dc = fleet.rack_manifold, fleet.cdu_manifold, fleet.manifold_dc
+    rack_w = np.broadcast_to(racks.liquid_design_w, loop_of_rack.shape)
+    rack_m3s = racks.lpm_per_kw * rack_w * (1e-3 * M3S_PER_LPM)
+    n_cdus = np.diff(fleet.cdu_offsets)
+    needed = n_cdus - np.broadcast_to(plants.spare, size)[dc]
+    loop_m3s = _sums(loop_of_rack, rack_m3s, loops)
+    loop_w = _sums(loop_of_rack, rack_w, loops)
+    design_w = (SPARE_CAPACITY * loop_w / needed)[loop_of_cdu]
+    cdu_w = np.where(np.isnan(cdus.capacity_w), design_w, cdus.capacity_w)
+    cdu_m3s = (loop_m3s / needed)[loop_of_cdu]
+    c_w_per_k = cdu_w / cdus.range_k
+    counted = (needed / n_cdus)[loop_of_cdu]
+    of_loop_w = _sums(loop_of_cdu, counted * cdu_w, loops)
+    heat_w = _sums(dc, of_loop_w, size)
+    per_loop = _sums(loop_of_cdu, counted * c_w_per_k, loops)
+    water_w_per_k = _sums(dc, per_loop, size)
+    j_per_l = np.broadcast_to(plants.density_kg_m3 * plants.heat_capacity_j_per_kg_k * 1e-3, size)
+    litres = np.broadcast_to(plants.coolant_l_per_kw, size)[dc] * of_loop_w * 1e-3
+    water_m3s = water_w_per_k / (WATER_KG_M3 * WATER_J_PER_KG_K)
+    return LiquidSizing(
+        rack_m3s=rack_m3s,
+        cdu_w=cdu_w,
+        cdu_m3s=cdu_m3s,
+        cdu_ua_w_per_k=exchanger_ua_w_per_k(
+            cdu_w, c_w_per_k, c_w_per_k, approach_k=cdus.approach_k
+        ),
+        cdu_w_per_k=c_w_per_k,
+        cdu_pump_w=np.asarray(pump_w(cdus.head_kpa, cdu_m3s, cdus.pump_efficiency)),
+        loop_j_per_k=litres * j_per_l[dc],
+        heat_w=heat_w,
+        water_w_per_k=water_w_per_k,
+        water_j_per_k=plants.water_l_per_kw * heat_w * (1e-6 * WATER_KG_M3 * WATER_J_PER_KG_K),
+        facility_pump_w=np.asarray(pump_w(plants.head_kpa, water_m3s, plants.pump_efficiency)),
+        # With equal capacity rates, water and air differ by the approach everywhere.
+        cooler_ua_w_per_k=heat_w / plants.approach_k,
+        fan_w=plants.fan_share * heat_w,
+    )
 
 
 def liquid_at_full_load_w(racks: RackParameters) -> F64:
