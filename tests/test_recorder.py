@@ -157,6 +157,7 @@ def test_rerun_verifies_the_recording(run: Run) -> None:
     done = verify(run.path)
     assert done.returncode == 0, done.stderr
     assert "1 file verified without error" in done.stdout + done.stderr
+    assert not [entity for entity in run.recorded if "liquid" in entity or "junction" in entity]
 
 
 @pytest.mark.parametrize("dc", FOCUS)

@@ -35,6 +35,8 @@ VALID_RANGE_C = (-50.0, 100.0)
 """Lowest and highest valid end of a range of inlets, in C."""
 MAX_CLASSES = 254
 """Largest number of classes with a value, so that classes with class 0 fit into a byte."""
+JUNCTION_RANGE_K = 45.0
+"""Range of the colours of junctions below the temperature at which GPUs throttle, in K."""
 RANGE_CLASSES = 200
 """Largest number of classes within the range of the colours; the others are beyond its ends."""
 
@@ -77,6 +79,8 @@ class ColourScale(NamedTuple):
     """Value of class 1. Values below count as this value."""
     marks: tuple[tuple[float, str], ...] = ()
     """Values with a name, such as limits, which the colour bar marks."""
+    no_value: str = "no rack"
+    """Name of class 0."""
 
     @property
     def digits(self) -> int:
@@ -153,7 +157,7 @@ def colours_of(scale: ColourScale) -> npt.NDArray[np.uint32]:
 @functools.lru_cache(maxsize=32)
 def annotation_context(scale: ColourScale) -> rr.AnnotationContext:
     """Return Rerun's description of the colours and names of the classes of a scale."""
-    return named_classes(["no rack", *labels(scale)], colours_of(scale).tolist())
+    return named_classes([scale.no_value, *labels(scale)], colours_of(scale).tolist())
 
 
 def invisible_names(names: Sequence[str]) -> rr.AnnotationContext:
@@ -285,6 +289,20 @@ def outlet_scale(inlet_range: InletRange, outlet_c: Reals) -> ColourScale:
     return make_scale(low, high, "C", [Band(low, high, INFERNO)])
 
 
+def junction_scale(throttle_c: float, trip_c: float) -> ColourScale:
+    """Return the colour scale of junctions, whose colours change where GPUs throttle, in C.
+
+    Args:
+        throttle_c: junction temperature at which GPUs throttle, in C.
+        trip_c: junction temperature at which racks trip, in C.
+    """
+    low = throttle_c - JUNCTION_RANGE_K
+    bands = [Band(low, throttle_c, RECOMMENDED), Band(throttle_c, trip_c, ALLOWABLE)]
+    marks = [(throttle_c, "throttle"), (trip_c, "trip")]
+    scale = make_scale(low, trip_c, "C", bands, marks=marks)
+    return scale._replace(no_value="cooled by air")
+
+
 def power_scale(fleet: Fleet) -> ColourScale:
     """Return the colour scale of rack power, in kW.
 
@@ -292,7 +310,9 @@ def power_scale(fleet: Fleet) -> ColourScale:
     tenth for fans), rounded up to 1, 2 or 5 times a power of ten.
     """
     nameplate_w = np.concatenate([count * full_w for count, full_w, *_ in fleet.group_rows])
-    largest_kw = float(fleet.group_sums(nameplate_w).max()) * 1.1 / 1e3
+    liquid_w = [r.design_it_w for config in fleet.configs for r in config.liquid_racks().values()]
+    largest_w = max([float(fleet.group_sums(nameplate_w).max()), *liquid_w])
+    largest_kw = largest_w * 1.1 / 1e3
     decade = 10.0 ** np.floor(np.log10(largest_kw))
     high = float(decade * next(n for n in (1, 2, 5, 10) if n * decade >= largest_kw * (1 - 1e-9)))
     return make_scale(0.0, high, "kW", [Band(0.0, high, VIRIDIS)], beyond=False)

@@ -93,6 +93,11 @@ EVENT_SHADES = {
     "dry_cooler_down": (GREEN, "++"),
     "outdoor_air_closed": (GREEN, "oo"),
     "rack_fan_failure": (GREY, ".."),
+    "cdu_down": (PINK, "//"),
+    "cdu_pump_down": (PINK, "||"),
+    "facility_pump_down": (PINK, "xx"),
+    "cooler_down": (PINK, "++"),
+    "leak": (PINK, ".."),
     "heat_wave": ("#B8A800", "--"),
 }
 """Colour and hatching of each kind of event.

@@ -385,7 +385,7 @@ def outline_hottest(axes: Axes, grid: F64, outlined: bool | None = None) -> str:
     hottest = np.argwhere(grid >= grid.max() - TIE_K)
     row, rack = np.unravel_index(grid.argmax(), grid.shape)
     place = f"row {row} rack {rack}" + (f" and {len(hottest) - 1} more" * (len(hottest) > 1))
-    if len(hottest) == grid.size > 1:
+    if len(hottest) == np.ma.count(grid) > 1:  # racks without a value are masked
         place = "all racks alike"
     elif grid.size <= MAX_LABELLED_RACKS if outlined is None else outlined:
         for y, x in hottest + 0.04:

@@ -1,4 +1,4 @@
-"""Maps of the racks of a hall over a whole run: highest inlet, and hours above the recommended one.
+"""Maps of the racks of a hall: highest inlet, hours above the recommended one, junctions.
 
 Several runs of one hall are drawn beside each other with the same colours, so that variants can be
 compared rack by rack.
@@ -6,7 +6,7 @@ compared rack by rack.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -45,8 +45,8 @@ _BAR_IN = 0.22
 """Width of a colour bar, in inches."""
 _TICKS_APART = 12
 """Least distance of a tick of the colour bar from a limit, as a divisor of the range of the bar."""
-_BEYOND_ALLOWABLE = "#4B0055"
-"""Colour of racks above the allowable inlet."""
+_BEYOND_LIMIT = "#4B0055"
+"""Colour of racks above the allowable inlet, or above the junction temperature of a trip."""
 _SHADES = 256
 """Number of colours of a map."""
 
@@ -77,17 +77,37 @@ def inlet_map(racks_of: Mapping[str, pd.DataFrame], hall: HallConfig, allowable_
             f"hottest inlet {grid.max():.1f} °C, {abs(over_k):.1f} K {side} the recommended "
             f"{RECOMMENDED_C[1]:g} °C, at "
         )
-    cmap = _inlet_colours(*limits, allowable_c)
+    cmap = _banded_colours(limits, RECOMMENDED_C[1], allowable_c)
     figure, image = _draw_maps(grids, titles, _Scale(cmap, limits, ".1f"), has_marks=True)
-    bar = _colour_bar(figure, image, "highest inlet (°C)")
     named = ((RECOMMENDED_C[1], "recommended"), (allowable_c, "allowable"))
-    marks = {limit_c: text for limit_c, text in named if limits[0] <= limit_c <= limits[1]}
-    apart_k = (limits[1] - limits[0]) / _TICKS_APART
-    ticks = [t for t in bar.get_ticks() if all(abs(t - limit_c) >= apart_k for limit_c in marks)]
-    texts = [f"{t:g}" for t in ticks] + [f"{c:g} {text}" for c, text in marks.items()]
-    bar.set_ticks([*ticks, *marks], labels=texts)
-    for limit_c in marks:
-        bar.ax.axhline(limit_c, color="black", linewidth=2.0)
+    _mark_limits(_colour_bar(figure, image, "highest inlet (°C)"), limits, named)
+    return figure
+
+
+def junction_map(junction_c: F64, hall: HallConfig, limits_c: tuple[float, float]) -> Figure:
+    """Draw the junction temperature of every liquid-cooled rack; racks cooled by air are grey.
+
+    Args:
+        junction_c: junction temperature of each rack, in C, (R,); 0 for racks cooled by air.
+        hall: the hall.
+        limits_c: junction temperatures at which GPUs throttle and at which racks trip, in C.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    grid = np.ma.masked_equal(junction_c.reshape(hall.rows, hall.racks_per_row), 0.0)
+    throttle_c, trip_c = limits_c
+    low_c, high_c = float(np.floor(grid.min())), float(np.ceil(grid.max()))
+    limits = low_c, max(high_c, throttle_c, low_c + MIN_COLOUR_RANGE_K)
+    below_k = throttle_c - float(grid.max())
+    title = (
+        f"hottest junction {grid.max():.1f} °C, {abs(below_k):.1f} K "
+        f"{'below' if below_k > 0 else 'above'} the {throttle_c:g} °C of throttling, at "
+    )
+    scale = _Scale(_banded_colours(limits, throttle_c, trip_c), limits, ".1f")
+    figure, image = _draw_maps({"": grid}, {"": title}, scale, has_marks=True)
+    named = ((throttle_c, "throttle"), (trip_c, "trip"))
+    _mark_limits(_colour_bar(figure, image, "junction (°C)"), limits, named)
     return figure
 
 
@@ -181,6 +201,24 @@ def _colour_bar(figure: Figure, image: Any, label: str) -> Any:
     )
 
 
+def _mark_limits(bar: Any, limits: tuple[float, float], named: Sequence[tuple[float, str]]) -> None:
+    """Mark temperatures on a colour bar with their names, if they are within its range.
+
+    Args:
+        bar: the colour bar.
+        limits: values at the ends of the colours, in C.
+        named: temperatures in C, each with its name.
+    """
+    marks = {limit_c: text for limit_c, text in named if limits[0] <= limit_c <= limits[1]}
+    apart_k = (limits[1] - limits[0]) / _TICKS_APART
+    inside = [t for t in bar.get_ticks() if limits[0] <= t <= limits[1]]
+    ticks = [t for t in inside if all(abs(t - limit_c) >= apart_k for limit_c in marks)]
+    texts = [f"{t:g}" for t in ticks] + [f"{c:g} {text}" for c, text in marks.items()]
+    bar.set_ticks([*ticks, *marks], labels=texts)
+    for limit_c in marks:
+        bar.ax.axhline(limit_c, color="black", linewidth=2.0)
+
+
 def _number_racks(axes: Axes, image: Any, grid: Any, scale: _Scale, columns: int) -> None:
     """Write the value of each rack into its cell, if the cells are large enough."""
     if not _has_numbers(grid, columns):
@@ -209,21 +247,25 @@ def _has_numbers(grid: Any, columns: int) -> bool:
     )
 
 
-def _inlet_colours(low_c: float, high_c: float, allowable_c: float) -> Colormap:
-    """Return colours of inlets from ``low_c`` to ``high_c``, which change at the limits."""
+def _banded_colours(limits: tuple[float, float], warm_c: float, hot_c: float) -> Colormap:
+    """Return colours of temperatures that change at two limits.
+
+    Args:
+        limits: temperatures at the ends of the colours, in C.
+        warm_c: temperature up to which the colours are blue and green, in C.
+        hot_c: temperature from which the colour is violet, in C.
+    """
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap, to_rgba
 
-    inlet_c = low_c + (high_c - low_c) * (np.arange(_SHADES) + 0.5) / _SHADES
-    recommended_c = RECOMMENDED_C[1]
-    cool_top_c, warm_top_c = min(high_c, recommended_c), min(high_c, allowable_c)
-    cool = np.interp(inlet_c, (min(low_c, cool_top_c - 1e-3), cool_top_c), (0.05, 0.8))
-    warm_low_c = max(low_c, recommended_c)
-    warm = np.interp(inlet_c, (warm_low_c, max(warm_top_c, warm_low_c + 1e-3)), (0.2, 0.95))
+    low_c, high_c = limits
+    shade_c = low_c + (high_c - low_c) * (np.arange(_SHADES) + 0.5) / _SHADES
+    cool_top_c, warm_top_c = min(high_c, warm_c), min(high_c, hot_c)
+    cool = np.interp(shade_c, (min(low_c, cool_top_c - 1e-3), cool_top_c), (0.05, 0.8))
+    warm_low_c = max(low_c, warm_c)
+    warm = np.interp(shade_c, (warm_low_c, max(warm_top_c, warm_low_c + 1e-3)), (0.2, 0.95))
     colours = np.where(
-        (inlet_c <= recommended_c)[:, None],
-        colormaps["YlGnBu_r"](cool),
-        colormaps["YlOrRd"](warm),
+        (shade_c <= warm_c)[:, None], colormaps["YlGnBu_r"](cool), colormaps["YlOrRd"](warm)
     )
-    colours[inlet_c > allowable_c] = to_rgba(_BEYOND_ALLOWABLE)
+    colours[shade_c > hot_c] = to_rgba(_BEYOND_LIMIT)
     return ListedColormap(colours)

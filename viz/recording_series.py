@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import rerun as rr
 
 from sdc_taichi.types import F64, QUANTITIES
 
@@ -150,6 +152,9 @@ PLOTS: dict[str, Plot] = {
 Plots of the queue, CRAC units and rewards are not included.
 """
 
+MAX_DEVICE_LINES = 24
+"""Largest number of CRAC units or CDUs with a line each; for more, plots show minimum, mean and
+maximum."""
 QUEUE_ENTITY = "queue_tasks"
 """Entity of the plot of queued tasks by age."""
 QUEUE_COLOURS = (SKY, BLUE, ORANGE, RED)
@@ -281,3 +286,36 @@ def line_factors(plot: Plot, step_h: float) -> F64:
     to_unit = {("W", "kW"): 1e-3, ("kWh", "kW"): 1.0 / step_h, ("g CO2e", "kg/step"): 1e-3}
     units = ["1" if field == "pue" else QUANTITIES[field].unit for _, field, _ in plot.lines]
     return np.array([to_unit.get((unit, plot.unit), 1.0) for unit in units])
+
+
+def series_lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
+    """Return Rerun's description of the names and colours of the lines of a plot."""
+    # Colours are an array, because Rerun reads a list of three or four numbers as one colour.
+    return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
+
+
+def device_lines(count: int, device: str, quantity: str) -> tuple[list[str], list[int]]:
+    """Return names and colours of the lines of a quantity of CRAC units or CDUs.
+
+    There is one line per device, or lines for minimum, mean and maximum over many devices.
+
+    Args:
+        count: number of devices.
+        device: name of a device, such as ``unit``.
+        quantity: name of the quantity, with its unit in brackets.
+    """
+    if count > MAX_DEVICE_LINES:
+        return [f"{which} {quantity}" for which in ("lowest", "mean", "highest")], list(PALETTE[:3])
+    others = [colour for colour in PALETTE if colour != RED]
+    colours = [others[number % len(others)] for number in range(count)]
+    return [f"{device} {number} {quantity}" for number in range(count)], colours
+
+
+def low_mean_high(values: F64) -> F64:
+    """Return minimum, mean and maximum over many devices in T steps, (T, n) to (T, 3).
+
+    Values of at most ``MAX_DEVICE_LINES`` devices are returned unchanged.
+    """
+    if values.shape[1] <= MAX_DEVICE_LINES:
+        return values
+    return np.stack([values.min(axis=1), values.mean(axis=1), values.max(axis=1)], axis=1)

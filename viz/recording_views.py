@@ -20,7 +20,9 @@ from sdc_taichi.types import F64
 
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, annotation_context, invisible_names
+from .liquid_loop import SIZE as DIAGRAM_SIZE
 from .recording_flows import ABOUT_PATH, FLOW_PLOTS, MAP_PATH, FlowPictures
+from .recording_liquid import CDU_PLOTS, LIQUID_PLOTS
 from .recording_racks import (
     DOWN_RGB,
     TRENDS,
@@ -40,13 +42,13 @@ from .recording_series import (
     RED,
     REWARDS_ENTITY,
     STATE_COLOURS,
+    device_lines,
+    series_lines,
 )
 from .recording_text import rack_place
 
 PLAYBACK_S_PER_S = 14_400.0
 """Simulated seconds per second of playback."""
-MAX_UNIT_LINES = 24
-"""Largest number of CRAC units with one line each; for more, plots show minimum, mean, maximum."""
 
 MAP_TITLES = {
     "inlet": "rack inlet",
@@ -54,6 +56,7 @@ MAP_TITLES = {
     "rise": "rack inlet less supply air",
     "outlet": "rack outlet",
     "power": "rack power",
+    "junction": "junction of liquid-cooled racks",
 }
 """Titles of the maps, keyed by quantity."""
 MAX_UNIT_LABELS = 8
@@ -225,7 +228,8 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
     )
     airflow = [_airflow_view(tab)] if tab.has_airflow else []
     zones = [_zones_view(tab)] if tab.zones else []
-    return rrb.Tabs(overview, racks, *airflow, *zones, cooling, work, active_tab=0)
+    liquid = [_liquid_view(tab)] if "junction" in tab.scales else []
+    return rrb.Tabs(overview, racks, *airflow, *zones, cooling, *liquid, work, active_tab=0)
 
 
 def _airflow_view(tab: FocusTab) -> Any:
@@ -244,6 +248,28 @@ def _airflow_view(tab: FocusTab) -> Any:
         origin=f"{tab.path}/airflow/sources", name="parts of their inlets"
     )
     return rrb.Vertical(shares, close_ups, sources, row_shares=[4, 4, 3], name="airflow")
+
+
+def _liquid_view(tab: FocusTab) -> Any:
+    """Return the diagram of the loops, and the plots of loops and CDUs."""
+    diagram = rrb.Spatial2DView(
+        origin=f"{tab.path}/liquid/loop",
+        name="loops: racks, CDUs, heat reuse, cooler",
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(0, DIAGRAM_SIZE[0]), y_range=(0, DIAGRAM_SIZE[1])
+        ),
+    )
+    plots = [
+        _plot_view(f"{tab.path}/liquid/{entity}", f"{plot.title} [{plot.unit}]")
+        for entity, plot in LIQUID_PLOTS.items()
+    ]
+    cdus = [
+        _plot_view(f"{tab.path}/liquid/{entity}", f"CDU {title}")
+        for entity, (_, title, _) in CDU_PLOTS.items()
+    ]
+    return rrb.Vertical(
+        diagram, rrb.Grid(*plots, *cdus, grid_columns=2), row_shares=[1, 2], name="liquid"
+    )
 
 
 def _zones_view(tab: FocusTab) -> Any:
@@ -290,7 +316,9 @@ def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
     if quantity == "change":
         name = f"{name} {tab.reference}"
     title = f"{name} [{scale.unit}]"
-    marks = "racks", "crac", "down", "down_text", "hottest", "hottest_text"
+    marks = ["racks", "crac", "down", "down_text"]
+    if quantity != "junction":  # the mark is at the hottest inlet
+        marks += ["hottest", "hottest_text"]
     image = _rack_map(tab, f"{tab.path}/map/{quantity}", title, marks)
     return rrb.Vertical(image, bar, row_shares=[5, 2], name=quantity)
 
@@ -384,7 +412,7 @@ def _whole_run() -> Any:
 def fleet_entities() -> Entities:
     """Yield the static entities of the fleet: line styles."""
     for entity, plot in FLEET_PLOTS.items():
-        yield f"fleet/{entity}", _lines([plot.title], [plot.colour])
+        yield f"fleet/{entity}", series_lines([plot.title], [plot.colour])
 
 
 def data_center_entities(
@@ -407,17 +435,17 @@ def data_center_entities(
     """
     for entity, plot in PLOTS.items():
         names = [f"{name} [{plot.unit}]" for name, *_ in plot.lines]
-        yield f"{path}/series/{entity}", _lines(names, [colour for *_, colour in plot.lines])
-    yield f"{path}/series/{QUEUE_ENTITY}", _lines(QUEUE_NAMES, QUEUE_COLOURS)
+        yield f"{path}/series/{entity}", series_lines(names, [colour for *_, colour in plot.lines])
+    yield f"{path}/series/{QUEUE_ENTITY}", series_lines(QUEUE_NAMES, QUEUE_COLOURS)
     if rewards:
         reward_colours = [PALETTE[i % len(PALETTE)] for i in range(len(rewards))]
         names = [f"{name} [-]" for name in rewards]
-        yield f"{path}/series/{REWARDS_ENTITY}", _lines(names, reward_colours)
+        yield f"{path}/series/{REWARDS_ENTITY}", series_lines(names, reward_colours)
     units = int(fleet.unit_offsets[dc + 1] - fleet.unit_offsets[dc])
-    names, unit_colours = _unit_lines(units, "supply [C]")
+    names, unit_colours = device_lines(units, "unit", "supply [C]")
     names, unit_colours = [*names, "return, all units [C]"], [*unit_colours, RED]
-    yield f"{path}/crac/temperature_c", _lines(names, unit_colours)
-    yield f"{path}/crac/airflow_m3s", _lines(*_unit_lines(units, "airflow [m3/s]"))
+    yield f"{path}/crac/temperature_c", series_lines(names, unit_colours)
+    yield f"{path}/crac/airflow_m3s", series_lines(*device_lines(units, "unit", "airflow [m3/s]"))
     state_colours = np.array(STATE_COLOURS, np.uint32)
     for entity, (_, states) in COMMAND_STATES.items():
         shown = rr.StateConfiguration(values=states, labels=states, colors=state_colours)
@@ -524,24 +552,6 @@ def _hall_entities(
         fill_mode="solid", colors=DOWN_RGB, show_labels=units > MAX_UNIT_LABELS
     )
     yield f"{path}/down", style
-
-
-def _unit_lines(units: int, quantity: str) -> tuple[list[str], list[int]]:
-    """Return names and colours of the lines of a quantity of CRAC units.
-
-    There is one line per unit, or lines for minimum, mean and maximum over many units.
-    """
-    if units > MAX_UNIT_LINES:
-        return [f"{which} {quantity}" for which in ("lowest", "mean", "highest")], list(PALETTE[:3])
-    others = [colour for colour in PALETTE if colour != RED]
-    colours = [others[unit % len(others)] for unit in range(units)]
-    return [f"unit {unit} {quantity}" for unit in range(units)], colours
-
-
-def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
-    """Return Rerun's description of the names and colours of the lines of a plot."""
-    # Colours are an array, because Rerun reads a list of three or four numbers as one colour.
-    return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
 def _colour_bar(path: str, scale: ColourScale) -> Entities:

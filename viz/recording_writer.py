@@ -10,6 +10,7 @@ A recording has these entities, where NAME is the name of a data center in focus
     dc/NAME/zones/..., zone_racks/...  zones of a large hall, and the racks of each zone
     dc/NAME/hall/{inlet,outlet}        3D hall, a voxel per rack and level
     dc/NAME/series/..., crac/...       series, each entity with lines of one unit
+    dc/NAME/liquid/...                 loops and CDUs of liquid-cooled racks
     dc/NAME/actions/...                commands, as states
     dc/NAME/events                     log of events
     flows/...                          work that sites of a fleet send to each other
@@ -41,11 +42,13 @@ from sdc_taichi.types import F64, I64, Reals, StepResult
 from . import colour_scales
 from . import hall_rasters as rasters
 from .colour_scales import ColourScale, InletRange
+from .liquid_loop import junction_limits_c
 from .rack_histories import RackHistory
 from .recording_airflow import AirflowPictures
 from .recording_blocks import MAX_BLOCK_BYTES, Block, BlockBuilder, choose_cadence
 from .recording_flows import FlowPictures
 from .recording_frames import Pictures
+from .recording_liquid import LiquidPictures
 from .recording_output import RecordingOutput
 from .recording_racks import (
     TRENDS,
@@ -68,11 +71,11 @@ from .recording_series import (
     REWARDS_ENTITY,
     Cadence,
     line_factors,
+    low_mean_high,
 )
 from .recording_states import StatePictures
 from .recording_text import ConditionLog, LogEntry, summary_markdown
 from .recording_views import (
-    MAX_UNIT_LINES,
     FocusTab,
     data_center_entities,
     fleet_entities,
@@ -432,6 +435,9 @@ class RecordingWriter:
             "outlet": colour_scales.outlet_scale(self._inlet_range, first["outlet"]),
             "power": colour_scales.power_scale(self._fleet),
         }
+        limits = junction_limits_c(self._fleet.configs[self._focus[index]])
+        if limits is not None:
+            scales["junction"] = colour_scales.junction_scale(*limits)
         if self._builder.has_reference:
             scales["change"] = colour_scales.difference_scale(5.0)
         return scales
@@ -463,8 +469,7 @@ class RecordingWriter:
             self._write_scalars(f"{path}/series/{REWARDS_ENTITY}", times, terms)
         units = self._builder.units[index]
         supply_c, flow_m3s = block.unit_supply_c[:, units], block.unit_flow_m3s[:, units]
-        if units.stop - units.start > MAX_UNIT_LINES:
-            supply_c, flow_m3s = _low_mean_high(supply_c), _low_mean_high(flow_m3s)
+        supply_c, flow_m3s = low_mean_high(supply_c), low_mean_high(flow_m3s)
         air_c = np.concatenate([supply_c, values[:, FIELD_ROWS["return_c"], None]], axis=1)
         self._write_scalars(f"{path}/crac/temperature_c", times, air_c)
         self._write_scalars(f"{path}/crac/airflow_m3s", times, flow_m3s)
@@ -593,16 +598,11 @@ class RecordingWriter:
 
 
 def _pictures_of(sim: Simulator, dc: int, cadence: Cadence) -> Iterator[Pictures]:
-    """Yield the pictures of a data center besides heat maps: states, airflow and zones."""
+    """Yield the pictures of a data center besides heat maps: states, airflow, zones, liquid."""
     yield StatePictures(sim, dc)
     if sim.fleet.air is not None:
         yield AirflowPictures(sim, dc, cadence)
     if sim.fleet.configs[dc].hall.racks > MIN_RACKS:
         yield ZonePictures(sim, dc)
-
-
-def _low_mean_high(unit_values: F64) -> F64:
-    """Return minimum, mean and maximum over U CRAC units in T steps, (T, U) to (T, 3)."""
-    return np.stack(
-        [unit_values.min(axis=1), unit_values.mean(axis=1), unit_values.max(axis=1)], axis=1
-    )
+    if sim.fleet.configs[dc].liquid is not None:
+        yield LiquidPictures(sim, dc, cadence)

@@ -198,7 +198,8 @@ def open_tabs(viewer: ViewerClient, *names: str) -> None:
         container = parts.get("ContainerBlueprint", {})
         if container.get("container_kind") != "Tabs":
             continue
-        for part in container["contents"]:
+        contents = container["contents"]
+        for part in [contents] if isinstance(contents, str) else contents:
             fields = blueprint[part].get("ContainerBlueprint", blueprint[part].get("ViewBlueprint"))
             if fields.get("display_name") in names:
                 container["active_tab"] = part

@@ -1,0 +1,154 @@
+"""Liquid-cooled halls in recordings and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_rgba
+
+from rrd import images, read, scalars, verify
+from sdc_taichi import Recorder, Simulator, load_config
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import QUANTITIES, LiquidQuantities, StepResult
+from sdc_taichi.viz import liquid_figures, rack_maps
+from sdc_taichi.viz.liquid_loop import LOOP_FIELDS, junction_limits_c, loop_texts
+from sdc_taichi.viz.plotting import darken, drawn
+from sdc_taichi.viz.recording_liquid import CDU_PLOTS, LIQUID_PLOTS
+from sdc_taichi.viz.recording_series import line_factors
+
+SMALL = ["name=ai", "hall.rows=2", "hall.racks_per_row=4", "hall.supply_approach_k=5",
+         "hall.return_approach_k=-3", "hvac.sizing.model=design_day",
+         "hall.rack_types={gpu: {model: gb200_nvl72}, web: {servers: {count: 18, full_w: 600, "
+         "idle_w: 170, design_rise_k: 13}}}",
+         "hall.rack_plan=[{type: web, racks: 0-1}, {type: gpu, racks: 2-3}]",
+         "liquid={cdus: {per_manifold: 2}, reuse: {kind: heat_pump, share: 0.5}}"]  # fmt: skip
+AIR_RACKS, LIQUID_RACKS = [0, 1, 4, 5], [2, 3, 6, 7]
+STEPS = 6
+
+
+@dataclass
+class Recorded:
+    fleet: Fleet
+    results: list[StepResult]
+    path: Path
+    entities: dict[str, dict[str, list[Any]]]
+
+
+def with_liquid(result: StepResult, fleet: Fleet) -> StepResult:
+    """The result with other values of all liquid quantities, which pictures read."""
+    rng = np.random.default_rng(result.step)
+    for name in (field.name for field in fields(LiquidQuantities)):
+        values = getattr(result, name)
+        low, high = {"W": (1e5, 1e6), "C": (20.0, 90.0)}.get(QUANTITIES[name].unit, (0.0, 1.0))
+        values[:] = rng.uniform(low, high, values.shape)
+    result.rack_junction_c[AIR_RACKS] = 0.0
+    return result
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
+    path, results = tmp_path_factory.mktemp("liquid") / "run.rrd", []
+    with Simulator(load_config("corrected", SMALL)) as sim, Recorder(path, every=2) as recorder:
+        sim.reset()
+        recorder.begin(sim)
+        for _ in range(STEPS):
+            results.append(with_liquid(sim.step(), sim.fleet))
+            recorder.add(results[-1])
+        recorder.close()
+        yield Recorded(sim.fleet, results, path, read(path))
+
+
+def test_loops_and_cdus_are_recorded_in_every_step(recorded: Recorded) -> None:
+    assert verify(recorded.path).returncode == 0
+    for entity, plot in LIQUID_PLOTS.items():
+        of_results = [
+            [getattr(r, field)[0] for _, field, _ in plot.lines] for r in recorded.results
+        ]
+        expected = np.array(of_results) * line_factors(plot, recorded.results[0].step_h)
+        np.testing.assert_allclose(scalars(recorded.entities[f"/dc/ai/liquid/{entity}"]), expected)
+    for entity, (field, _, factor) in CDU_PLOTS.items():
+        each = [factor * getattr(result, field) for result in recorded.results]
+        np.testing.assert_allclose(scalars(recorded.entities[f"/dc/ai/liquid/{entity}"]), each)
+
+
+def test_junctions_are_a_map_and_texts_of_the_diagram_move(recorded: Recorded) -> None:
+    junctions = recorded.entities["/dc/ai/map/junction"]
+    assert junctions["step"] == [0, 2, 4]
+    maps = images(junctions)
+    height, width = maps.shape[1] // 2, (maps.shape[2] + 1) // 4
+    tiles = maps[:, height // 2 :: height + 1, width // 2 :: width].reshape(3, -1)
+    each_c = np.array([result.rack_junction_c for result in recorded.results[::2]])
+    assert np.isnan(tiles[:, AIR_RACKS]).all()
+    np.testing.assert_allclose(tiles[:, LIQUID_RACKS], each_c[:, LIQUID_RACKS], atol=0.26)
+    texts = recorded.entities["/dc/ai/liquid/loop/texts"]
+    liquid = recorded.fleet.configs[0].liquid
+    assert liquid is not None
+    for result, labels in zip(recorded.results[::2], texts["Points2D:labels"][-3:], strict=True):
+        values = {name: float(getattr(result, name)[0]) for name in LOOP_FIELDS}
+        shown = "\n".join(loop_texts(values, liquid, "C").values())
+        assert "\n".join(labels) == shown
+        assert f"{result.cdu_return_c[0]:.1f} C" in labels
+        assert f"heat pump {result.heat_pump_w[0] / 1e3:,.0f} kW" in labels
+
+
+def test_diagram_shows_the_devices_of_the_config(recorded: Recorded) -> None:
+    values = {name: float(getattr(recorded.results[0], name)[0]) for name in LOOP_FIELDS}
+    for more, shown, hidden in (
+        ([], "heat pump", "trim chiller"),
+        (["liquid.reuse={}", "liquid.facility.trim_kw=300"], "trim chiller", "delivered"),
+    ):
+        liquid = load_config("corrected", SMALL + more).liquid
+        assert liquid is not None
+        (axes,) = liquid_figures.loop_diagram(values, liquid, "ai").axes
+        text = " ".join(each.get_text() for each in axes.texts)
+        assert shown in text
+        assert hidden not in text
+        assert f"{values['cdu_supply_c']:.1f} °C" in text
+
+
+def test_junction_map_shows_racks_in_air_grey() -> None:
+    config = load_config("corrected", SMALL)
+    limits_c = junction_limits_c(config)
+    assert limits_c == (85.0, 105.0)
+    junction_c = np.zeros(8)
+    junction_c[LIQUID_RACKS] = 70.0, 86.0, 72.0, 71.0
+    figure: Any = rack_maps.junction_map(junction_c, config.hall, limits_c)
+    axes, bar = figure.axes
+    assert [text.get_text() for text in axes.texts] == ["70.0", "86.0", "72.0", "71.0"]
+    assert "1.0 K above the 85 °C of throttling, at row 0 rack 3" in axes.get_title(loc="left")
+    assert "85 throttle" in [text.get_text() for text in bar.get_yticklabels()]
+    assert axes.get_facecolor() == to_rgba("#DDDDDD")
+    mesh = axes.collections[0]
+    cool, warm = mesh.cmap(mesh.norm([84.9, 85.1]))
+    assert cool[1] > cool[0]
+    assert warm[0] > warm[2] + 0.2
+
+
+def test_history_stacks_heat_and_power(recorded: Recorded) -> None:
+    times = pd.date_range("2026-07-01", periods=STEPS, freq="15min")
+    columns = {
+        n: [float(getattr(r, n)[0]) for r in recorded.results] for n in liquid_figures.COLUMNS
+    }
+    steps = pd.DataFrame({"time": times, **columns})
+    steps.loc[2, "liquid_stored_w"] = -5e4
+    figure: Any = liquid_figures.loop_history(steps, 85.0, "ai")
+    temperatures, heat, power = figure.axes
+    lines = [
+        line.get_ydata()[:-1] for line in temperatures.lines[: len(liquid_figures.TEMPERATURES)]
+    ]
+    np.testing.assert_array_equal(lines, [steps[n] for n, *_ in liquid_figures.TEMPERATURES])
+    for axes, parts in ((heat, liquid_figures.HEAT), (power, liquid_figures.POWER)):
+        tops = [part.get_datalim(axes.transData).y1 for part in axes.collections]
+        total = np.maximum(steps[[name for name, *_ in parts]], 0.0).sum(axis=1).max() / 1e3
+        scale = 1e3 if "(MW)" in axes.get_ylabel() else 1.0
+        assert max(tops) * scale == pytest.approx(total, rel=1e-9)
+    assert heat.dataLim.y0 * (1e3 if "(MW)" in heat.get_ylabel() else 1.0) == pytest.approx(-50.0)
+    light = np.asarray(drawn(figure, 60)).astype(int)
+    darken(figure)
+    assert light[0, 0].min() - int(np.asarray(drawn(figure, 60))[0, 0].max()) > 200
