@@ -24,15 +24,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from sdc_taichi.plant.liquid import (
+    CduParameters,
+    conductance_w_per_k,
+    exchanger_ua_w_per_k,
+    ua_share,
+)
+
 F64 = npt.NDArray[np.float64]
 FITTED = ("201609", "201705")
 DESIGN_W = 800e3
 """Heat for which the exchangers of the CDUs are sized, about the highest of a year."""
-WALL, SECONDARY_SHARE = 0.1, 0.5
-"""Defaults of the package: share of the wall in the resistance, of the secondary film in the
-rest."""
-FLOWS = (0.05, 3.0)
-"""Lowest and highest facility flow relative to design."""
 
 
 @dataclass(frozen=True)
@@ -95,26 +97,6 @@ def months(folder: Path) -> dict[str, Month]:
     return {path.stem[-6:]: read_month(path) for path in sorted(folder.glob("NREL_HPCDC_*.csv"))}
 
 
-def phi(x: F64) -> F64:
-    """(1 - exp(-x))/x, and 1 at 0."""
-    small = np.abs(x) < 1e-6
-    return np.where(small, 1.0 - 0.5 * x, -np.expm1(-x) / np.where(small, 1.0, x))
-
-
-def conductance_w_per_k(flow: F64, heat_transfer_w_per_k: float, coolant_w_per_k: float) -> F64:
-    """K, heat over the difference of entering temperatures, at a facility flow over design.
-
-    Counterflow by effectiveness and number of transfer units (Kays and London), films of both
-    sides as flow to the power 3/4; the secondary flow is at design.
-    """
-    resistance = WALL + (1 - WALL) * (SECONDARY_SHARE + (1 - SECONDARY_SHARE) * flow**-0.75)
-    least = coolant_w_per_k * np.minimum(1.0, flow)
-    ratio = np.minimum(flow, 1.0 / flow)
-    units = heat_transfer_w_per_k / resistance / least
-    reached = units * phi(units * (1.0 - ratio))
-    return least * reached / (1.0 + ratio * reached)
-
-
 def liquid_w(hall: Hall, heat_w: F64) -> F64:
     """Heat of the liquid-cooled racks into their coolant."""
     return hall.capture * np.maximum(heat_w - hall.air_only_w, 0.0)
@@ -123,16 +105,26 @@ def liquid_w(hall: Hall, heat_w: F64) -> F64:
 def return_c(hall: Hall, heat_w: F64, supply_c: F64) -> F64:
     """Facility water leaving the CDUs, whose valves hold the secondary supply at its setpoint."""
     into_w, rate = liquid_w(hall, heat_w), hall.coolant_w_per_k
-    # Design: equal flows on both sides, so NTU = e/(1 - e) with e = range/(range + approach).
-    heat_transfer = DESIGN_W / hall.approach_k
-    wanted = np.maximum(into_w / np.maximum(hall.setpoint_c + into_w / rate - supply_c, 0.1), 1.0)
-    # Newton for 1/K over 1/flow, which is nearly a straight line.
-    lowest, highest = 1.0 / FLOWS[1], 1.0 / FLOWS[0]
-    at = np.clip(rate / wanted, lowest, highest)
+    ua = exchanger_ua_w_per_k(DESIGN_W, rate, rate, approach_k=hall.approach_k)
+
+    def resistance(at: F64) -> F64:
+        """1/K at a flow of 1/at relative to design."""
+        share = ua_share(
+            1.0,
+            1.0 / at,
+            wall_share=CduParameters.wall_share,
+            side_share=CduParameters.side_share,
+        )
+        return 1.0 / conductance_w_per_k(ua * share, rate, rate / at)
+
+    wanted = np.maximum(hall.setpoint_c + into_w / rate - supply_c, 0.1) / np.maximum(into_w, 1.0)
+    # Newton for the resistance over 1/flow, which is nearly a straight line.
+    lowest, highest = 1.0 / CduParameters.max_valve, 1.0 / CduParameters.min_valve
+    at = np.clip(rate * wanted, lowest, highest)
     for _ in range(6):
-        value = 1.0 / conductance_w_per_k(1.0 / at, heat_transfer, rate)
-        beside = 1.0 / conductance_w_per_k(1.0 / (at * (1 + 1e-5)), heat_transfer, rate)
-        at = np.clip(at + (1.0 / wanted - value) * 1e-5 * at / (beside - value), lowest, highest)
+        value = resistance(at)
+        slope = (resistance(at * (1 + 1e-5)) - value) / (1e-5 * at)
+        at = np.clip(at + (wanted - value) / slope, lowest, highest)
     return supply_c + into_w * at / rate
 
 
