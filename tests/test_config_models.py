@@ -45,6 +45,7 @@ EVENTS: dict[EventKind, dict[str, Any]] = {
     "rack_fan_failure": {"rack": 2, "share": 0.7},
     "heat_wave": {"offset_k": 4.5},
     "grid_outage": {},
+    "link_down": {},
 }
 
 

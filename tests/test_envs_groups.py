@@ -11,8 +11,8 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import sdc_taichi
-from sdc_taichi import Actions, ConfigError, SdcError, load_config
-from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi import Actions, ConfigError, SdcError, load_config, make_controller
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.site_order import cleaner_first
 from sdc_taichi.envs.view_terms import OF_DATA_CENTERS, UTILISATIONS
 from sdc_taichi.sim.fleet import build_fleet
@@ -237,8 +237,9 @@ def test_agents_of_a_fleet_have_the_names_of_their_sites() -> None:
     assert np.ptp(clocks) == 0
 
 
-def test_a_site_sends_work_to_the_cleanest_site_first() -> None:
-    env = PARALLEL_ENV(**GEO, collaboration=1.0)
+@pytest.mark.parametrize("rewards_of", ["default", {"agent_geo": {"geo_cost": 10.0}}])
+def test_a_site_sends_work_to_the_cleanest_site_first(rewards_of: Any) -> None:
+    env = PARALLEL_ENV(**GEO, rewards=rewards_of, collaboration=1.0)
     env.reset(seed=0, options={"start_day": 180})
     view = env.core.view
     ci = view.now.ci_g_per_kwh
@@ -255,16 +256,51 @@ def test_a_site_sends_work_to_the_cleanest_site_first() -> None:
     result, terms = env.core.view.last, env.core._rewards._context
     sizing = env.core.view.sizing
     to = order[dirtiest][0]
-    coming = terms.coming_ci
-    moved_g = (
-        flows.sum() * task_kwh(env.core.sim.fleet, sizing)[0] * (coming[to] - coming[dirtiest])
-    )
-    total_g = moved_g + result.transfer_g.sum()
-    design_g = sizing.facility_w[dirtiest] * env.core.sim.step_h / 1e3 * 500.0
-    assert rewards[agent] == pytest.approx(-10.0 * total_g / design_g, rel=1e-6)
+    coming, now, scale = terms.coming_ci, result.ci_g_per_kwh, 500.0
+    if rewards_of != "default":
+        coming, now, scale = terms.coming_price, result.price_per_kwh, 0.1
+    moved = flows.sum() * task_kwh(env.core.sim.fleet, sizing)[0] * (coming[to] - coming[dirtiest])
+    total = moved + (result.transfer_kwh * now).sum()
+    design = sizing.facility_w[dirtiest] * env.core.sim.step_h / 1e3 * scale
+    assert rewards[agent] == pytest.approx(-10.0 * total / design, rel=1e-6)
+    assert total != 0.0
     idle = [f"{name}/agent_geo" for i, name in enumerate(names) if i != dirtiest]
     assert [rewards[name] for name in idle] == [0.0, 0.0]
-    assert list(OF_DATA_CENTERS) == ["hall_power", "hall_heat", "geo_carbon"]
+    assert AGENT_DEFINITIONS["agent_geo"].scales["bill"] == {"geo_cost": 10.0, "high_power": 10.0}
+    assert list(OF_DATA_CENTERS) == ["hall_power", "hall_heat", "geo_carbon", "geo_cost"]
+
+
+def test_agents_of_a_site_whose_links_are_down_do_not_act() -> None:
+    cut = load_config(
+        "fleet_of_eight",
+        [
+            "fleet.sites=[AZ, CA, WA]",
+            "events.scheduled=[{kind: link_down, site: WA, start_h: 0, duration_h: 0.5}]",
+        ],
+    )
+    env = PARALLEL_ENV(**(GEO | {"config": cut}))
+    _, infos = env.reset(seed=0)
+    assert [infos[f"{site}/agent_geo"]["acts"] for site in ("AZ", "CA", "WA")] == [1, 1, 1]
+    assert "acts" not in infos["WA/agent_ls"]
+    names = [f.name for f in env.core.features["agent_geo"] for _ in range(f.size)]
+    rooms, link = np.array(names) == "site_room", np.array(names) == "site_link"
+    for step in range(1, 4):
+        observations, *_, infos = env.step(zeros(env))
+        is_down = step < 3
+        assert infos["WA/agent_geo"]["acts"] == 1 - is_down
+        assert infos["CA/agent_geo"]["acts"] == 1
+        assert (observations["WA/agent_geo"][link] == 0) == is_down
+        # WA has the cleanest grid.
+        seen = observations["AZ/agent_geo"]
+        assert (seen[rooms] == 0).tolist() == [is_down, False]
+        assert seen[link] > 0
+        view = env.core.view
+        for rule in ("geo-all-to-cleanest", "geo-three-cleanest", "geo-all-cleaner", "geo-central"):
+            transfer = make_controller(rule, view.fleet).act(view).transfer
+            assert transfer is not None
+            assert bool(transfer[:, 2].any()) == (not is_down)
+            assert not transfer[2].any()
+            assert transfer.any()
 
 
 def test_commands_of_controllers_are_actions_of_sites() -> None:

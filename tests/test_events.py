@@ -83,6 +83,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         scheduled("pump_down", 7.0, 1.0, share=0.5),
         scheduled("tower_cell_down", 8.0, 1.0, share=0.75),
         scheduled("tank_down", 9.0, 1.0, share=0.25),
+        scheduled("link_down", 10.0, 1.0),
     )
     line = timeline(
         data_center("a"),
@@ -92,7 +93,15 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         steps_per_hour=1,
     )
     assert not line.event_free
-    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True], *[[1.0, 1.0]] * 3]
+    normal = [
+        [True] * 5,
+        [1.0, 1.0],
+        [1.0] * 6,
+        [0.0, 0.0],
+        [True, True],
+        *[[1.0, 1.0]] * 3,
+        [True, True],
+    ]
     expected = {
         1: (0, [True, True, True, True, False]),
         2: (1, [1.0, 0.4]),
@@ -103,8 +112,9 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         7: (5, [1.0, 0.5]),
         8: (7, [1.0, 0.75]),
         9: (6, [1.0, 0.25]),
+        10: (8, [True, False]),
     }
-    for step in range(11):
+    for step in range(12):
         wanted = list(normal)
         if step in expected:
             place, values = expected[step]
@@ -323,6 +333,14 @@ def test_rules_of_a_data_center_are_independent() -> None:
         (
             "sampled=[{kind: grid_outage, per_year: 9000, duration_h: [1, 2]}]",
             r"events\.sampled\.0\.per_year: .* 8760 \(got 9000\)$",
+        ),
+        (
+            "sampled=[{kind: link_down, per_year: 1, duration_h: [1, 2]}]",
+            r"events\.sampled\.0\.kind link_down needs a fleet; valid with fleet\.sites$",
+        ),
+        (
+            "scheduled=[{kind: grid_outage, start_h: 0, duration_h: 1, site: NY}]",
+            r"events\.scheduled\.0: site has no meaning for grid_outage$",
         ),
     ],
 )

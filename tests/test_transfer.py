@@ -286,6 +286,63 @@ def test_a_fleet_is_the_same_alone_in_a_batch_and_from_a_saved_state() -> None:
                 assert all(np.array_equal(value, again[name]) for name, value in result.items())
 
 
+CUT: dict[str, Any] = {
+    "scheduled": [
+        {"kind": "link_down", "site": "wa", "start_h": 2, "duration_h": 1},
+        {"kind": "link_down", "start_h": 5, "duration_h": 0.5},
+    ]
+}
+TO_WA = np.array([[0, 0, 0.2, 0.8], [0, 0, 0.2, 0.8], [0.2, 0, 0, 0.8], [0.5, 0.5, 0, 0]])
+
+
+def test_nothing_is_sent_from_or_to_a_site_whose_links_are_down() -> None:
+    config = fleet_of(delay_steps=2, link_share_per_hour=0.3)
+    whole = make_configs(config, count=2)
+    cut = make_configs(with_values(config, {"events": CUT}))
+    actions = Actions(load=0.5, transfer=np.tile(TO_WA, (2, 1)))
+    balance = np.zeros(2)
+    with Simulator(whole) as before, Simulator([*whole[:4], *cut]) as sim:
+        before.reset(seed=3)
+        sim.reset(seed=3)
+        for t in range(28):
+            usual, result = before.step(actions), sim.step(actions)
+            for name, value in result.per_dc().items():
+                same = slice(0, 8 if t < 8 else 4)
+                assert np.array_equal(value[same], usual.per_dc()[name][same]), (name, t)
+            down = [3] if 8 <= t < 12 else [0, 1, 2, 3] if 20 <= t < 22 else []
+            assert np.flatnonzero(sim.link_up() == 0).tolist() == [4 + site for site in down]
+            assert np.flatnonzero(result.active_events).tolist() == [4 + site for site in down]
+            flow, landed = sim.flows_tasks()[1], result.landed_tasks[4:]
+            assert not flow[down].any()
+            assert not flow[:, down].any()
+            assert np.all(result.refused_tasks[4:][down] > 0)
+            # Work on its way arrives, two steps after it left.
+            assert (landed[3] > 0) == (2 <= t < 10 or 14 <= t < 22 or t >= 24), t
+            if len(down) < 4:
+                assert flow[0, 2] > 0
+            balance += (result.arrived_tasks - result.executed_tasks).reshape(2, 4).sum(axis=1)
+            balance -= (result.dropped_tasks + result.lost_tasks).reshape(2, 4).sum(axis=1)
+            waiting = (result.queue_tasks + result.in_flight_tasks).reshape(2, 4).sum(axis=1)
+            np.testing.assert_allclose(balance, waiting, rtol=0, atol=1e-9)
+
+
+def test_links_of_each_site_fail_on_their_own() -> None:
+    rule = {"kind": "link_down", "per_year": 2000, "duration_h": [1, 2]}
+    config = with_values(fleet_of(), {"events": {"sampled": [rule]}})
+    with Simulator(config) as sim:
+        sim.reset(seed=1)
+        rows = []
+        for _ in range(200):
+            sim.step(Actions(transfer=TO_WA))
+            rows.append(sim.link_up())
+            senders, receivers = sim.flows_tasks()[0].nonzero()
+            assert np.all(rows[-1][[*senders, *receivers]] > 0)
+            assert len(senders) or rows[-1].sum() < 3
+    up = np.array(rows)
+    assert np.all(up.mean(axis=0) < 0.9)
+    assert len(np.unique(up, axis=1).T) == 4
+
+
 def test_a_fleet_that_sends_nothing_is_its_sites_alone() -> None:
     fleet = build_fleet(fleet_of())
     lone = [config.model_copy(update={"fleet": None}) for config in fleet.configs]
@@ -435,6 +492,9 @@ def test_other_bad_input() -> None:
     config = fleet_of()
     with pytest.raises(ConfigError, match=r"sites NY: tiny has fleet\.sites; valid is one of"):
         make_configs(config, sites=["NY"])
+    unknown = {"scheduled": [CUT["scheduled"][0] | {"site": "XX"}]}
+    with pytest.raises(ConfigError, match=r"0\.site 'XX': valid is one of AZ, CA, NY, WA$"):
+        with_values(config, {"events": unknown})
     with pytest.raises(ConfigError, match=r"workload\.model tasks: a fleet needs fluid"):
         with_values(config, {"workload.model": "tasks"})
     with pytest.raises(ConfigError, match=r"site\.weather_file 'a\.epw' of tiny would be read"):

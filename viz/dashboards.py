@@ -99,6 +99,7 @@ EVENT_SHADES = {
     "cooler_down": (PINK, "++"),
     "leak": (PINK, ".."),
     "heat_wave": ("#B8A800", "--"),
+    "link_down": (GREY, "//"),
 }
 """Colour and hatching of each kind of event.
 

@@ -282,7 +282,7 @@ def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
         return f"rack fans failed: {place}, airflow at {event.share:.0%}"
     if event.kind == "heat_wave":
         return f"heat wave, {event.offset_k:+g} K"
-    return "grid outage"
+    return "links to other sites down" if event.kind == "link_down" else "grid outage"
 
 
 def summary_markdown(

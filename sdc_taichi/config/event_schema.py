@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sdc_taichi.config.fields import AirC, Plant, RiseK, Section, Share
+from sdc_taichi.config.fields import AirC, Name, Plant, RiseK, Section, Share
 
 EventKind = Literal[
     "crac_down",
@@ -19,6 +19,7 @@ EventKind = Literal[
     "rack_fan_failure",
     "heat_wave",
     "grid_outage",
+    "link_down",
 ]
 
 WaveK = Annotated[float, Field(ge=-40, le=40)]
@@ -47,8 +48,9 @@ _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "rack_fan_failure": ("rack", "share"),
     "heat_wave": ("offset_k",),
     "grid_outage": (),
+    "link_down": (),
 }
-_OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",)}
+_OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",), "link_down": ("site",)}
 PLANT_OF_EVENT: dict[EventKind, Plant] = {
     "tower_cell_down": "water_cooled",
     "dry_cooler_down": "air_cooled",
@@ -113,6 +115,8 @@ class ScheduledEvent(Section):
     """Number of the CRAC unit that fails, counted from 0; None means all units."""
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
     """Number of the rack whose fans fail, counted from 0, row by row."""
+    site: Name | None = None
+    """Site of the fleet whose links fail; None means all sites."""
     share: Share | None = None
     """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air or
     rack airflow that remain, as a share of all, 0..1."""
@@ -128,7 +132,8 @@ class ScheduledEvent(Section):
 class SampledEvent(Section):
     """Failures or weather events at random times: a Poisson process with uniform durations.
 
-    All CRAC units, or all racks, are equally likely to fail.
+    All CRAC units, or all racks, are equally likely to fail. Each site of a fleet has events of its
+    own.
     """
 
     kind: EventKind
@@ -163,7 +168,7 @@ class EventsConfig(Section):
 
 def _check_fields_of_kind(event: ScheduledEvent | SampledEvent) -> None:
     required, optional = _REQUIRED[event.kind], _OPTIONAL.get(event.kind, ())
-    for name in ("unit", "rack", "share", "offset_k"):
+    for name in ("unit", "rack", "site", "share", "offset_k"):
         if name not in type(event).model_fields:
             continue
         has_value = getattr(event, name) is not None

@@ -338,6 +338,11 @@ class DataCenterConfig(Section):
                         f"events.{name}.{index}.kind {event.kind} needs hvac.plant {needed}, "
                         f"not {plant}"
                     )
+                if event.kind == "link_down" and self.fleet is None:
+                    raise ValueError(
+                        f"events.{name}.{index}.kind link_down needs a fleet; valid with "
+                        "fleet.sites"
+                    )
         return self
 
     @model_validator(mode="after")
@@ -350,6 +355,12 @@ class DataCenterConfig(Section):
                     raise ValueError(
                         f"events.scheduled.{index}.{name} {number}: valid is 0..{limit - 1}"
                     )
+            sites = () if self.fleet is None else self.fleet.sites
+            if event.site is not None and event.site.upper() not in map(str.upper, sites):
+                raise ValueError(
+                    f"events.scheduled.{index}.site {event.site!r}: valid is one of "
+                    f"{', '.join(sites)}"
+                )
         check_one_per_rack("hvac.crac.unit_shares", crac.unit_shares, racks)
         for rack, shares in enumerate(crac.unit_shares or ()):
             if len(shares) != crac.units or abs(sum(shares) - 1.0) > 1e-9:

@@ -1,5 +1,7 @@
 """Rules that send work between the sites of a fleet, by the present carbon intensity.
 
+No rule sends work from or to a site whose links were down in the last step.
+
 B data centers form F fleets of S sites, see ``Fleet.sites_per_fleet``.
 """
 
@@ -61,8 +63,9 @@ class Alone(WithoutMemory):
     def act(self, view: View) -> Actions:
         """Return shares of flexible work to send."""
         sites = view.fleet.sites_per_fleet
-        shares = self._destinations(view.now.ci_g_per_kwh.reshape(-1, sites))
-        return Actions(transfer=shares.reshape(-1, sites))
+        ci = np.where(view.link_up > 0, view.now.ci_g_per_kwh, np.inf)
+        shares = self._destinations(ci.reshape(-1, sites)).reshape(-1, sites)
+        return Actions(transfer=shares * view.link_up[:, None])
 
 
 class Central:
@@ -95,12 +98,12 @@ class Central:
             self._capacity = fleet.values("workload.max_utilisation") * TASKS_PER_STEP
         sites, now = fleet.sites_per_fleet, view.now
         own = now.demand * TASKS_PER_STEP
-        flexible = self._flexible_share * own
+        flexible = self._flexible_share * own * view.link_up
         free = np.maximum(self._capacity - own - view.state.queue[:, -1], 0.0)
         flow = central_flows(
             now.ci_g_per_kwh.reshape(-1, sites),
             np.minimum(flexible, shared.site_tasks).reshape(-1, sites),
-            np.minimum(free, shared.site_tasks).reshape(-1, sites),
+            (np.minimum(free, shared.site_tasks) * view.link_up).reshape(-1, sites),
             self._link.reshape(-1, sites, sites),
             self._ratio.reshape(-1, sites)[:, 0],
         )

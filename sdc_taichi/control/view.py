@@ -253,6 +253,9 @@ class View:
     flows_tasks: F64
     """Work that sites of each fleet sent to each other in the last step, in tasks, by fleet, sender
     and receiver, (F, S, S)."""
+    link_up: F64
+    """1 for sites of fleets whose links worked in the last step, 0 for those that could neither
+    send nor get work, (B,)."""
     zone_loads: ZoneLoads | None
     """Loads of the zones of halls, see ``workload.zone_loads``; None without any."""
     forecast_error: ForecastError = PERFECT
@@ -389,7 +392,7 @@ def view_maker(
     zones, even = UnitZones(sim.fleet), np.ones(sim.fleet.units)
     has_fans = sim.fleet.models["crac_flow"] == "controlled"
     sites = sim.fleet.sites_per_fleet
-    no_flows = np.zeros((sim.size // sites, sites, sites))
+    no_flows, all_up = np.zeros((sim.size // sites, sites, sites)), np.ones(sim.size)
     if forecast_error != PERFECT:
         seeds = walk_keys(sim.state.seed, sim.fleet.names) if keys is None else keys
         walks = RandomWalks(seeds, step_h)
@@ -407,6 +410,7 @@ def view_maker(
             zones,
             sim.supply_ratio() if last is not None and has_fans else even,
             sim.flows_tasks().copy() if last is not None and sites > 1 else no_flows,
+            sim.link_up() if sites > 1 else all_up,
             sim.zone_loads,
             forecast_error,
             walks,

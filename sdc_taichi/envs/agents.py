@@ -107,7 +107,11 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
         part="geo",
         commands=("transfer",),
         features=(*_CLOCK, "workload", "queue", *_CI, *_OTHER_SITES),
-        scales={"default": {"geo_carbon": 10.0}, "bill": {}, "paper": {"carbon": 1.0}},
+        scales={
+            "default": {"geo_carbon": 10.0},
+            "bill": {"geo_cost": 10.0, "high_power": 10.0},
+            "paper": {"carbon": 1.0},
+        },
     ),
     "crac": AgentDefinition(
         part="cooling",

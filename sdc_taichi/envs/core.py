@@ -59,7 +59,7 @@ from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.unit_slots import slots_of_groups
 from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
 from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
-from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
 from sdc_taichi.sim.drivers import local_start, utc_start
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet_configs import MOST_DCS, with_sites
@@ -299,7 +299,9 @@ class Core:
         require_events_start_before(steps / fleet.steps_per_hour, fleet.configs, "the episode")
         self.steps = steps
 
-    def reset(self, seed: Seed = None, start_day: Any = None) -> dict[str, Observation]:
+    def reset(
+        self, seed: Seed = None, start_day: Any = None, start_hour: int = 0
+    ) -> dict[str, Observation]:
         """Start an episode in all environments.
 
         Args:
@@ -308,6 +310,8 @@ class Core:
                 system's entropy.
             start_day: first day of the episodes as ``MM-DD`` or as number of the day in the year,
                 from 0; or one day for each environment. None uses the option ``start``.
+            start_hour: first hour of the episodes after the midnight of the first day; hours before
+                and after that day are those of its neighbours.
 
         Returns:
             Observations before the first step, by learning agent.
@@ -332,7 +336,8 @@ class Core:
             inputs = self._inputs.drivers(self._draw)
         # Sites of a fleet have different events and forecast errors.
         events, self._keys = (self._of_each_site(x) for x in (events, keys))
-        start = np.repeat(days * self._steps_per_day, self._sites)
+        steps = days * self._steps_per_day + start_hour * self.sim.fleet.steps_per_hour
+        start = np.repeat(steps % (DAYS_PER_YEAR * self._steps_per_day), self._sites)
         if self._sites > 1:
             utc_offset_h = (inputs or self.sim.drivers).utc_offset_h
             start = local_start(start, utc_offset_h, self.sim.fleet.steps_per_hour)
@@ -546,6 +551,11 @@ class Core:
         return by_env
 
     @property
+    def observer(self) -> Any:
+        """Observer that computes the observations."""
+        return self._observer
+
+    @property
     def view(self) -> View:
         """What controllers see of the data centers before the next step.
 
@@ -570,18 +580,25 @@ class Core:
         return idle
 
     def masks(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return True for the agents that act, by group with an agent for each unit, (B, W).
+        """Return True for the agents that act, by group of ``masked_groups``, (B, W) or (E, S).
 
-        The action of an agent is without effect if its unit was down in the last step, or does not
-        exist.
+        The action of an agent is without effect if its unit or the links of its site were down
+        in the last step, or if its unit does not exist.
         """
-        if not self.slots:
-            return {}
+        masks: dict[str, npt.NDArray[np.bool_]] = {}
         running = {CRAC_UNITS: self.view.unit_running}
-        return {
-            agent: (slots.fill(running[AGENT_DEFINITIONS[agent].axis]) > 0) & slots.exists
-            for agent, slots in self.slots.items()
-        }
+        for agent in self.masked_groups:
+            if (slots := self.slots.get(agent)) is None:
+                masks[agent] = self._by_env(self.view.link_up > 0)
+            else:
+                units = running[AGENT_DEFINITIONS[agent].axis]
+                masks[agent] = (slots.fill(units) > 0) & slots.exists
+        return masks
+
+    @property
+    def masked_groups(self) -> tuple[str, ...]:
+        """Groups whose agents may be without effect: those of units, and of transfers."""
+        return tuple(a for a in self.agents if a in self.slots or a == "agent_geo")
 
     def zone_heat_k_h(self) -> dict[str, F64]:
         """Return the excess of the hottest inlet of each agent's zone over 27 C, in K h, (B, W).

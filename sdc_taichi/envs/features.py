@@ -554,18 +554,20 @@ def site_ci_forecast(view: View) -> F64:
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: x.other_sites)
 def site_room(view: View) -> F64:
-    """Room for work at the other sites, as a share of a full queue, in the order of `site_ci`."""
+    """Room at the other sites, as a share of a full queue; 0 while the links of a site are down."""
     limit_h = view.fleet.values("workload.queue_limit_h")
     limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
     waiting = view.state.queue[:, -1] + view.state.in_flight.sum(axis=1)
-    return _of_others(view, 1.0 - waiting * view.step_h / (limit_h * TASKS_PER_STEP))
+    room = 1.0 - waiting * view.step_h / (limit_h * TASKS_PER_STEP)
+    return _of_others(view, np.where(view.link_up > 0, room, 0.0))
 
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: min(x.other_sites, 1))
 def site_link(view: View) -> F64:
     """Most work that the own site can send in a step, as a share of its capacity."""
     assert view.fleet.shared_work is not None
-    return view.fleet.shared_work.link_tasks[None] / TASKS_PER_STEP
+    tasks = np.where(view.link_up > 0, view.fleet.shared_work.link_tasks, 0.0)
+    return np.asarray(tasks[None] / TASKS_PER_STEP)
 
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, lambda x: 3 * min(x.other_sites, 1))

@@ -154,7 +154,8 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
     def _infos(self, infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the infos of each agent.
 
-        Agents of CRAC units have ``acts`` and ``zone_heat_k_h`` in addition.
+        Agents of CRAC units and of transfers have ``acts`` in addition, those of units also
+        ``zone_heat_k_h``.
         """
         masks, heat_k_h = self.core.masks(), self.core.zone_heat_k_h()
         by_agent: dict[str, dict[str, Any]] = {}
@@ -163,6 +164,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
                 by_agent[agent] = as_scalars(infos, i)
                 if group in masks:
                     by_agent[agent]["acts"] = int(masks[group][0, i])
+                if group in heat_k_h:
                     by_agent[agent]["zone_heat_k_h"] = float(heat_k_h[group][0, i])
         return by_agent
 

@@ -219,6 +219,11 @@ class ReleasedObserver:
         """Return the concatenated vectors of all agents before the coming step, (B, m)."""
         return np.concatenate([self._vector(agent, view) for agent in AGENTS], axis=1)
 
+    def scaled_ci(self, index: I64) -> F64:
+        """Return the carbon intensity in steps of the year, scaled as in the observations, (B,)."""
+        assert self._ci is not None, "reset comes first"
+        return self._ci.level_at(index)
+
     def _vector(self, agent: str, view: View) -> F32:
         if self._observed is None or self._observed[0] is not view:
             self._observed = view, self._entries(view)

@@ -7,10 +7,10 @@ of the servers at the initial setpoint. No action changes it, so the comparison 
 policy, but it removes most of the influence of the load (Weaver and Tao 2001). The mean of
 ``zone_power`` over the units of a data center is its ``hall_power``.
 
-**Transfers between sites.** Work that a site sends counts at the mean carbon intensity of the
-coming 24 h at the receiver, with the transfer, less that at the sender. Work that runs at once
-emits less or more than that; the terms ``work_carbon`` and ``cooling_carbon`` of the receiver
-contain the difference.
+**Transfers between sites.** Work that a site sends counts at the mean carbon intensity or price of
+the coming 24 h at the receiver, with the transfer, less that at the sender. Work that runs at once
+emits or costs less or more than that; the terms ``work_carbon`` and ``cooling_carbon``, or
+``work_cost`` and ``cooling_cost``, of the receiver contain the difference.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.reward_terms import CI_G_PER_KWH, TermContext
+from sdc_taichi.envs.reward_terms import CI_G_PER_KWH, PRICE_PER_KWH, TermContext
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.stages import SteadyFacility
@@ -120,17 +120,36 @@ def zone_heat(r: StepResult, v: View, c: ViewContext) -> F64:
 
 def geo_carbon(r: StepResult, v: View, c: ViewContext) -> F64:
     """Carbon of the sent work at the receivers with the transfer, less that at the sender."""
-    coming_ci, flows = c.terms.coming_ci, v.flows_tasks
+    added_g = _of_sent_work(r, v, c, r.ci_g_per_kwh, c.terms.coming_ci)
+    return np.asarray(-added_g / (c.terms.design_kwh * CI_G_PER_KWH))
+
+
+def geo_cost(r: StepResult, v: View, c: ViewContext) -> F64:
+    """Cost of the electricity of the sent work, analogous to `geo_carbon`, in units of `cost`."""
+    added = _of_sent_work(r, v, c, r.price_per_kwh, c.terms.coming_price)
+    return np.asarray(-added / (c.terms.design_kwh * PRICE_PER_KWH))
+
+
+def _of_sent_work(r: StepResult, v: View, c: ViewContext, now: F64, coming: F64) -> F64:
+    """Compute the carbon or cost that sent work adds, (B,), in the unit of ``now`` times kWh.
+
+    Args:
+        r: result of the step.
+        v: the view after the step.
+        c: context of the step.
+        now: carbon intensity or price in the step, per kWh, (B,).
+        coming: mean of the carbon intensity or price of the coming 24 h, per kWh, (B,).
+    """
+    flows = v.flows_tasks
     sites = flows.shape[-1]
-    ci_there, now_there = (x.reshape(-1, 1, sites) for x in (coming_ci, r.ci_g_per_kwh))
-    ci_here, now_here = (x.reshape(-1, sites, 1) for x in (coming_ci, r.ci_g_per_kwh))
-    moved_g = (flows * (ci_there - ci_here)).sum(axis=2).reshape(-1) * c.moved_kwh
+    there, now_there = (x.reshape(-1, 1, sites) for x in (coming, now))
+    here, now_here = (x.reshape(-1, sites, 1) for x in (coming, now))
+    moved = (flows * (there - here)).sum(axis=2).reshape(-1) * c.moved_kwh
     fleet_tasks = flows.sum(axis=(1, 2))
     fleet_kwh = r.transfer_kwh.reshape(-1, sites).sum(axis=1)
     kwh_per_task = fleet_kwh / np.where(fleet_tasks > 0.0, fleet_tasks, 1.0)
-    transfer_ci = (flows * (0.5 * (now_there + now_here))).sum(axis=2)
-    transfer_g = (transfer_ci * kwh_per_task[:, None]).reshape(-1)
-    return np.asarray(-(moved_g + transfer_g) / (c.terms.design_kwh * CI_G_PER_KWH))
+    mean_rates = (flows * (0.5 * (now_there + now_here))).sum(axis=2)
+    return np.asarray(moved + (mean_rates * kwh_per_task[:, None]).reshape(-1))
 
 
 def _per_sum(of_dc: F64, per_unit: F64, view: View) -> F64:
@@ -139,7 +158,9 @@ def _per_sum(of_dc: F64, per_unit: F64, view: View) -> F64:
     return np.asarray(of_dc / np.where(sums > 0.0, sums, 1.0) * (sums > 0.0))
 
 
-OF_DATA_CENTERS: dict[str, ViewTerm] = {f.__name__: f for f in (hall_power, hall_heat, geo_carbon)}
+OF_DATA_CENTERS: dict[str, ViewTerm] = {
+    f.__name__: f for f in (hall_power, hall_heat, geo_carbon, geo_cost)
+}
 """Terms of the agents of a data center, by name."""
 OF_UNITS: dict[str, ViewTerm] = {f.__name__: f for f in (zone_power, zone_heat)}
 """Terms of the agents of CRAC units, by name."""

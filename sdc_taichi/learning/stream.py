@@ -51,7 +51,8 @@ class LearnerSpaces:
     count: int = 1
     """Number W of agents in each environment that share the policy."""
     has_mask: bool = False
-    """True for agents of units, which are without effect while their units are down."""
+    """True for agents that may be without effect: those of units while these are down,
+    and those of transfers while the links of their sites are down."""
 
 
 class StreamStep(NamedTuple):
@@ -159,7 +160,7 @@ class EnvironmentStream:
             for agents in [(name,) for name in names] if own else [(group,)]:
                 of_agent = _learner_spaces(agents, *of_group)
                 count = 1 if own else len(names)
-                has_mask = AGENT_DEFINITIONS[group].per_unit
+                has_mask = group in core.masked_groups
                 self.spaces[agents[0]] = replace(of_agent, count=count, has_mask=has_mask)
         self.learners = tuple(self.spaces)
         self._shares_state = shares_state

@@ -63,6 +63,8 @@ class Disturbance:
     """Share of the buffer tank that is in use, 0..1, (B,)."""
     outdoor_units: F64
     """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
+    link_up: Mask
+    """True for each data center whose links to the sites of its fleet work, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +167,7 @@ class Timeline:
                 rack_airflow=np.ones(rack_offsets[-1]),
                 outdoor_offset_k=np.zeros(size),
                 grid_up=np.ones(size, dtype=np.bool_),
+                link_up=np.ones(size, dtype=np.bool_),
             )
         )
 
@@ -196,6 +199,7 @@ class Timeline:
             return self._normal
         normal = self._normal
         unit_up, grid_up = normal.unit_up.copy(), normal.grid_up.copy()
+        link_up = normal.link_up.copy()
         airflow = normal.rack_airflow.copy()
         offset_k = normal.outdoor_offset_k.copy()
         is_kind = {kind: events.kind == code for code, kind in enumerate(_KINDS)}
@@ -215,6 +219,7 @@ class Timeline:
         wave = events.where(is_kind["heat_wave"])
         np.add.at(offset_k, wave.dc, wave.value)
         grid_up[events.dc[is_kind["grid_outage"]]] = False
+        link_up[events.dc[is_kind["link_down"]]] = False
         return _read_only(
             Disturbance(
                 active=True,
@@ -224,6 +229,7 @@ class Timeline:
                 rack_airflow=airflow,
                 outdoor_offset_k=offset_k,
                 grid_up=grid_up,
+                link_up=link_up,
             )
         )
 
@@ -315,6 +321,9 @@ def schedule(
     listed, rules = [_EMPTY], []
     for dc, config in enumerate(configs):
         for event in config.events.scheduled:
+            # All sites of a fleet have the events of its configuration.
+            if event.site is not None and event.site.upper() != config.site.location.upper():
+                continue
             target = event.rack if event.kind == "rack_fan_failure" else event.unit
             listed.append(
                 _events(

@@ -213,6 +213,7 @@ class Simulator:
             surroundings.demand,
             surroundings.ci_g_per_kwh,
             capacity.utilisation,
+            event.link_up,
         )
         work = stages.workload.run(
             state.queue, surroundings.demand, commands.load_command, capacity.utilisation, transfer
@@ -348,6 +349,16 @@ class Simulator:
         The axes are fleet, sender and receiver, (F, S, S). It is 0 if no transfer was commanded.
         """
         return self._started().transfer.flows_tasks()
+
+    def link_up(self) -> F64:
+        """Return 1 for data centers whose links worked in the last step, else 0, (B,).
+
+        Data centers that run alone, and those before their first step, have 1.
+        """
+        last = self.state.step - 1
+        if last < 0:
+            return np.ones(self.size)
+        return self._timeline.at(last).link_up.astype(np.float64)
 
     def intake_air(self) -> IntakeAir:
         """Return the air before the racks in the last step, the input of ``Inlets``.

@@ -9,6 +9,7 @@ import numpy as np
 
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.sim.events import Mask
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.shared_work import SharedWork
 from sdc_taichi.sim.sizing import Sizing
@@ -41,15 +42,18 @@ class Flows:
         self._limits = (
             np.ascontiguousarray(shared.allowed.reshape(self._pairs)),
             np.ascontiguousarray(shared.pair_tasks.reshape(self._pairs)),
-            np.ascontiguousarray(shared.site_tasks.reshape(self._sites)),
+            np.zeros(self._sites),
         )
+        self._site_tasks = shared.site_tasks
         # These arrays are bound once: passing a new array costs more than copying its entries.
         self._shares, self.flow = np.zeros(self._pairs), np.zeros(self._pairs)
         self._flexible, self._room = np.zeros(self._sites), np.zeros(self._sites)
         self._totals = np.zeros((3, *self._sites))
         self._kernel: BoundKernel | None = None
 
-    def of(self, shares: F64, flexible: F64, room: F64) -> tuple[F64, F64, F64]:
+    def of(
+        self, shares: F64, flexible: F64, room: F64, link_up: Mask | bool = True
+    ) -> tuple[F64, F64, F64]:
         """Return work that each site sends, gets, and was to send but keeps, in tasks, (B,) each.
 
         ``flow`` has the work by sender and receiver, in tasks, (F, S, S), until the next call.
@@ -59,6 +63,7 @@ class Flows:
                 (B, S); values are limited to 0..1, and their sum to 1.
             flexible: Work that may go, in tasks, (B,).
             room: Work that each site can take, in tasks, (B,).
+            link_up: True for sites that can send and get work, (B,) or one value for all.
         """
         if self._kernel is None:
             from sdc_taichi.kernels.compiler.launch import BoundKernel
@@ -71,6 +76,7 @@ class Flows:
         self._shares[:] = shares.reshape(self._pairs)
         self._flexible.reshape(-1)[:], self._room.reshape(-1)[:] = flexible, room
         allowed, pair_limit, site_limit = self._limits
+        site_limit.reshape(-1)[:] = np.where(link_up, self._site_tasks, 0.0)
         self._kernel(
             self._pairs[0] <= SERIAL_UP_TO,
             1,
@@ -126,6 +132,7 @@ class Transfer:
         demand: F64,
         ci_g_per_kwh: F64,
         max_utilisation: F64 | float,
+        link_up: Mask,
     ) -> TransferResult:
         """Send flexible work of a step, and return it with the work that arrives.
 
@@ -136,6 +143,7 @@ class Transfer:
             ci_g_per_kwh: Carbon intensity of each site, in g CO2e/kWh, (B,).
             max_utilisation: Maximum work that the racks can run, as a share of all servers, (B,)
                 or one value for all.
+            link_up: True for sites whose links work, (B,). Work on its way arrives in any case.
         """
         sent, got, refused, kwh, carbon_g, on_way = np.zeros((6, self._size))
         if self._flows is None:
@@ -148,7 +156,7 @@ class Transfer:
             runs = np.minimum(in_flight[:, 0], np.maximum(capacity - own, 0.0))
             room = self._queue_limit - state.queue[:, -1] - in_flight.sum(axis=1) + runs
             flexible = self._flexible_share * own
-            sent, got, refused = self._flows.of(shares, flexible, np.maximum(room, 0.0))
+            sent, got, refused = self._flows.of(shares, flexible, np.maximum(room, 0.0), link_up)
             kwh = 0.5 * self.kwh_per_task * (sent + got)
             carbon_g = kwh * ci_g_per_kwh
         after = np.concatenate([in_flight[:, 1:], got[:, None]], axis=1)
