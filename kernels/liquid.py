@@ -36,6 +36,8 @@ LEAST_DRIVE_K = 1e-3
 """Smallest difference of water and air for which a cooler is controlled, in K."""
 MOST_TO_DOOR = 0.95
 """Largest share of the heat of a rack that a rear door takes."""
+LEAST_COP = 1.25
+"""Smallest COP of a heat pump."""
 LEAST_LIFT_K = 10.0
 """Smallest difference of sink and source of a heat pump, in K."""
 
@@ -252,6 +254,7 @@ def _set_flows(liquid: ti.template(), dc):
         if opening > 0.0:
             per_rack = scale * flow / opening
         pump_w, pump_heat_w, wanted = liquid.real(0.0), liquid.real(0.0), liquid.real(0.0)
+        loop.least_c = 1000.0
         c = first_cdu
         while c < end_cdu:
             cdu = liquid.cdus[c]
@@ -266,8 +269,9 @@ def _set_flows(liquid: ti.template(), dc):
             cdu.w_per_k = m3s * j_per_m3_k
             lowest_of_all_c = ti.min(lowest_of_all_c, setpoint_c)
             if m3s > 0.0:
-                lowest_c = ti.min(lowest_c, setpoint_c)
+                loop.least_c = ti.min(loop.least_c, setpoint_c)
             c += liquid.one
+        lowest_c = ti.min(lowest_c, loop.least_c)
         loop.flow_per_rack = per_rack
         loop.loss_w_per_k = loss
         loop.pump_w = pump_w
@@ -403,26 +407,27 @@ def _settle(liquid: ti.template(), dc):
                 tripped += 1
             r += liquid.one
     while m < end:
-        liquid.loops[m].supply_c = of_dc.room_c
+        liquid.loops[m].at_c = of_dc.room_c
         if liquid.loops[m].w_per_k > 0.0:
-            liquid.loops[m].supply_c = liquid.loops[m].wanted_c
+            liquid.loops[m].at_c = liquid.loops[m].wanted_c
         of_dc.cdu_pump_w = of_dc.cdu_pump_w + liquid.loops[m].pump_w
         m += liquid.one
     wanted_water_c = of_dc.facility_setpoint_c
-    sweep, change_k = 0, liquid.real(1.0)
+    sweep, change_k, excess_k = 0, liquid.real(1.0), liquid.real(0.0)
     while sweep < liquid.most_sweeps and change_k > liquid.real(SWEEP_TOLERANCE_K):
         of_dc.throttle_s = -1.0
         heat_w, water = liquid.real(0.0), liquid.real(0.0)
         m = first
         while m < end:
-            water += _settle_manifold(liquid, dc, m, most_open, wanted_water_c)
+            water += _settle_manifold(liquid, dc, m, most_open, wanted_water_c, excess_k)
             heat_w += liquid.loops[m].heat_w
             m += liquid.one
         supply_c = _settle_facility(liquid, dc, heat_w, water, wanted_water_c)
+        excess_k = supply_c - wanted_water_c
         change_k = 0.0
         m = first
         while m < end:
-            change_k = ti.max(change_k, _set_supply(liquid, m, supply_c))
+            change_k = ti.max(change_k, _set_supply(liquid, m, supply_c, sweep))
             m += liquid.one
         sweep += liquid.one
     of_dc.sweeps = sweep
@@ -430,14 +435,16 @@ def _settle(liquid: ti.template(), dc):
 
 @ti.func
 @no_type_check
-def _settle_manifold(liquid: ti.template(), dc, m, most_open, wanted_water_c):
+def _settle_manifold(liquid: ti.template(), dc, m, most_open, wanted_water_c, excess_k):
     """Compute racks and CDUs of a manifold at its present supply temperature.
+
+    Facility water was warmer than wanted by ``excess_k`` in the last sweep.
 
     Returns:
         Capacity rate of the facility water through its CDUs, in W/K.
     """
     loop, of_dc = liquid.loops[m], liquid.dcs[dc]
-    supply_c, rate, loss = loop.supply_c, loop.w_per_k, loop.loss_w_per_k
+    supply_c, rate, loss = loop.at_c, loop.w_per_k, loop.loss_w_per_k
     gain_w, slope, r = loop.pump_heat_w, liquid.real(0.0), liquid.rack_offsets[m]
     while r < liquid.rack_offsets[m + 1]:
         rack = liquid.racks[r]
@@ -449,44 +456,90 @@ def _settle_manifold(liquid: ti.template(), dc, m, most_open, wanted_water_c):
     room_c = of_dc.room_c
     return_c = (rate * supply_c + gain_w + loss * room_c) / (rate + loss)
     heat_w = gain_w - loss * (return_c - room_c)
-    # Without CDUs, or where pipes at the setpoint lose more than servers and pumps give, no heat is
-    # left for facility water. Rear doors then give less heat to warmer coolant, by ``slope``.
-    at_setpoint_w = gain_w - slope * ti.max(loop.wanted_c - supply_c, 0.0)
-    at_setpoint_c = (rate * loop.wanted_c + at_setpoint_w + loss * room_c) / (rate + loss)
+    # CDUs cannot make coolant colder than ``least_c``. Where pipes lose all heat at this supply,
+    # none is left for facility water. Rear doors give less heat to warmer coolant, by ``slope``.
+    least_c = loop.least_c + excess_k
+    at_least_w = gain_w - slope * ti.max(least_c - supply_c, 0.0)
+    back_c = (rate * least_c + at_least_w + loss * room_c) / (rate + loss)
     is_cooled = rate > 0.0 and most_open > 0.0
-    if not is_cooled or at_setpoint_w <= loss * (at_setpoint_c - room_c):
+    if not is_cooled or heat_w <= 0.0 or at_least_w <= loss * (back_c - room_c):
         return_c = room_c + gain_w / loss
         heat_w = 0.0
     loop.uncooled_c = room_c + (gain_w - slope * (room_c - supply_c)) / (loss + slope)
     loop.return_c = return_c
     loop.heat_w = heat_w
     loop.to_air_w = loss * (return_c - room_c) + loop.pump_w - loop.pump_heat_w
-    k_sum, water, wanted_sum = liquid.real(0.0), liquid.real(0.0), liquid.real(0.0)
-    return_wanted_c = loop.wanted_c
-    if rate > 0.0:
-        return_wanted_c += heat_w / rate
-    c, end = liquid.cdu_offsets[m], liquid.cdu_offsets[m + 1]
+    return _set_valves(liquid, dc, m, most_open, wanted_water_c)
+
+
+@ti.func
+@no_type_check
+def _set_valves(liquid: ti.template(), dc, m, most_open, water_c):
+    """Set the valves of the CDUs of a manifold for its heat and the wanted facility water.
+
+    Returns:
+        Capacity rate of the facility water, in W/K.
+    """
+    loop, of_dc = liquid.loops[m], liquid.dcs[dc]
+    first, end = liquid.cdu_offsets[m], liquid.cdu_offsets[m + 1]
+    c = first
     while c < end:
-        cdu = liquid.cdus[c]
-        setpoint_c = ti.max(cdu.setpoint_c, of_dc.least_setpoint_c)
-        wanted_sum += ti.max(cdu.w_per_k * (return_wanted_c - setpoint_c), 0.0)
+        liquid.cdus[c].is_full = 0.0
         c += liquid.one
-    c = liquid.cdu_offsets[m]
-    while c < end:
-        cdu = liquid.cdus[c]
-        setpoint_c = ti.max(cdu.setpoint_c, of_dc.least_setpoint_c)
-        share = ti.max(cdu.w_per_k * (return_wanted_c - setpoint_c), 0.0)
-        wanted = liquid.real(0.0)
-        if heat_w > 0.0 and wanted_sum > 0.0:
-            wanted = heat_w * share / wanted_sum / (return_wanted_c - wanted_water_c)
-        valve, k = _cdu_valve(liquid, c, wanted, most_open)
-        cdu.valve = valve
-        cdu.k_w_per_k = k
-        k_sum += k
-        water += valve * cdu.design_w_per_k
-        c += liquid.one
+    k_sum, water, passes = liquid.real(0.0), liquid.real(0.0), 0
+    # Where a valve of several is fully open, the others take over what is left.
+    while passes < 3:
+        return_c = _wanted_return_c(liquid, dc, m, water_c)
+        k_sum, water, c = 0.0, 0.0, first
+        passes += 3
+        while c < end:
+            cdu = liquid.cdus[c]
+            if cdu.is_full == 0.0:
+                setpoint_c = ti.max(cdu.setpoint_c, of_dc.least_setpoint_c)
+                wanted = liquid.real(0.0)
+                if loop.heat_w > 0.0:
+                    cooled_k = ti.max(return_c - setpoint_c, 0.0)
+                    wanted = cdu.w_per_k * cooled_k / (return_c - water_c)
+                valve, k = _cdu_valve(liquid, c, wanted, most_open)
+                cdu.valve = valve
+                cdu.k_w_per_k = k
+                if end - first > 1 and k < wanted * liquid.real(1.0 - 1e-6):
+                    cdu.is_full = 1.0
+                    passes = ti.min(passes, 2)
+            k_sum += cdu.k_w_per_k
+            water += cdu.valve * cdu.design_w_per_k
+            c += liquid.one
     loop.k_w_per_k = k_sum
     return water
+
+
+@ti.func
+@no_type_check
+def _wanted_return_c(liquid: ti.template(), dc, m, water_c):
+    """Return the return temperature at which CDUs at their setpoints take the heat, in C.
+
+    Those whose valve is fully open take K (T_return - T_water); those whose setpoint is above the
+    return take nothing.
+    """
+    return_c, before, count = liquid.real(1000.0), -1, 0
+    while count != before:
+        before = count
+        heat_w, w_per_k, c = liquid.loops[m].heat_w, liquid.real(0.0), liquid.cdu_offsets[m]
+        count = 0
+        while c < liquid.cdu_offsets[m + 1]:
+            cdu = liquid.cdus[c]
+            setpoint_c = ti.max(cdu.setpoint_c, liquid.dcs[dc].least_setpoint_c)
+            if cdu.is_full > 0.0:
+                w_per_k += cdu.k_w_per_k
+                heat_w += cdu.k_w_per_k * water_c
+            elif cdu.w_per_k > 0.0 and setpoint_c < return_c:
+                w_per_k += cdu.w_per_k
+                heat_w += cdu.w_per_k * setpoint_c
+                count += 1
+            c += liquid.one
+        if w_per_k > 0.0:
+            return_c = heat_w / w_per_k
+    return return_c
 
 
 @ti.func
@@ -518,17 +571,37 @@ def _cdu_valve(liquid: ti.template(), c, wanted, most_open):
 
 @ti.func
 @no_type_check
-def _set_supply(liquid: ti.template(), m, water_c):
+def _set_supply(liquid: ti.template(), m, water_c, sweep):
     """Set the supply of a manifold and results of its CDUs; return the change of the supply in K.
 
-    All CDUs get the same return: Q = K (T_return - T_water) for each and for their sum.
+    All CDUs get the same return: Q = K (T_return - T_water) for each and for their sum. The next
+    sweep starts from the supply at which the changes of the last two sweeps, continued in a
+    straight line, become 0, or between supplies that became warmer and colder if it lies outside.
     """
     loop = liquid.loops[m]
-    after_c = loop.uncooled_c
+    after_c, before_c = loop.uncooled_c, loop.at_c
     if loop.heat_w > 0.0 and loop.k_w_per_k > 0.0:
         loop.return_c = water_c + loop.heat_w / loop.k_w_per_k
         after_c = loop.return_c - loop.heat_w / loop.w_per_k
-    change_k = ti.abs(after_c - loop.supply_c)
+    change_k = after_c - before_c
+    if sweep == 0:
+        loop.low_c = -1000.0
+        loop.high_c = 1000.0
+    if change_k > 0.0:
+        loop.low_c = before_c
+    else:
+        loop.high_c = before_c
+    next_c, moved_k = after_c, before_c - loop.last_c
+    if sweep > 0 and ti.abs(moved_k) > liquid.real(1e-9):
+        slope = ti.min((change_k - loop.change_k) / moved_k, liquid.real(-0.125))
+        next_c = before_c - change_k / slope
+    if next_c <= loop.low_c or next_c >= loop.high_c:
+        next_c = ti.select(
+            loop.low_c > -999.0 and loop.high_c < 999.0, 0.5 * (loop.low_c + loop.high_c), next_c
+        )
+    loop.last_c = before_c
+    loop.change_k = change_k
+    loop.at_c = next_c
     loop.supply_c = after_c
     c = liquid.cdu_offsets[m]
     while c < liquid.cdu_offsets[m + 1]:
@@ -538,7 +611,7 @@ def _set_supply(liquid: ti.template(), m, water_c):
         if cdu.w_per_k > 0.0:
             cdu.supply_c = loop.return_c - cdu.heat_w / cdu.w_per_k
         c += liquid.one
-    return change_k
+    return ti.abs(change_k)
 
 
 @ti.func
@@ -574,6 +647,7 @@ def _reuse(liquid: ti.template(), dc, water, into_c, heat_w):
         while pass_ < 3:
             source_k = into_c - 0.5 * taken_w / water - of_dc.pinch_k + liquid.real(273.15)
             cop = of_dc.lorenz * of_dc.sink_k / ti.max(of_dc.sink_k - source_k, LEAST_LIFT_K)
+            cop = ti.max(cop, LEAST_COP)
             power_w = taken_w / (cop - 1.0)
             if taken_w + power_w > of_dc.reuse_demand_w or taken_w < most_w:
                 taken_w = ti.min(most_w, of_dc.reuse_demand_w * (1.0 - 1.0 / cop))

@@ -73,8 +73,9 @@ CDU_OUT = {
     "valve": "flow of facility water, as a share of design",
     "k_w_per_k": "heat per kelvin of return minus facility water, in W/K",
     "w_per_k": "heat capacity rate of the coolant, in W/K",
+    "is_full": "1 if its valve is fully open, else 0",
 }
-"""Results of each CDU, the last only used within the kernel."""
+"""Results of each CDU, the last two only used within the kernel."""
 LOOP_COEFFICIENTS = {"loop_j_per_k": "heat capacity of the coolant of the loop, in J/K"}
 """Constant of each manifold."""
 LOOP_STATE = {
@@ -84,6 +85,7 @@ LOOP_STATE = {
 LOOP_OUT = {
     "w_per_k": "heat capacity rate of the coolant, in W/K",
     "wanted_c": "mean setpoint of the CDUs by flow, in C",
+    "least_c": "lowest setpoint of the CDUs that run, in C",
     "flow_per_rack": "flow of a rack with an open valve, as a share of its design",
     "loss_w_per_k": "heat that pipes lose for each kelvin of return minus room, in W/K",
     "pump_w": "power of the pumps, in W",
@@ -91,6 +93,11 @@ LOOP_OUT = {
     "k_w_per_k": "heat of all CDUs per kelvin of return minus facility water, in W/K",
     "heat_w": "heat into facility water, in W",
     "uncooled_c": "supply that only pipes cool, in C",
+    "at_c": "supply at which the present sweep computes the racks, in C",
+    "last_c": "the same of the last sweep, in C",
+    "change_k": "change of the supply by the last sweep, in K",
+    "low_c": "last supply that a sweep has made warmer, in C",
+    "high_c": "last supply that a sweep has made colder, in C",
     "to_air_w": "heat of pipes and pumps into the air, in W",
 }
 """Values of each manifold within the kernel."""

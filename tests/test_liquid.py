@@ -614,6 +614,31 @@ def test_transient_at_rest_equals_steady() -> None:
         )
 
 
+def test_random_plants_that_hold_their_setpoint_are_at_rest() -> None:
+    rng = np.random.default_rng(5)
+    fleet = random_fleet(rng, 100)
+    inputs = replace(random_inputs(rng, fleet, failures=False), cdu_flow=None)
+    inputs.powered[:] = 1.0
+    state = Liquid(fleet, step_s=300.0).initial_state(inputs)
+    after, result = Liquid(fleet, step_s=300.0, transient=True).step(state, inputs)
+    # Water that is too warm opens valves further in transient halls only.
+    holds = np.abs(result.facility_supply_c - result.facility_setpoint_c) < 1e-4
+    assert np.count_nonzero(holds) > 60
+    loops = holds[fleet.manifold_dc]
+    axes = {
+        "junction_c": loops[fleet.rack_manifold],
+        "manifold_return_c": loops,
+        "manifold_supply_c": loops,
+        "facility_return_c": holds,
+        "facility_supply_c": holds,
+    }
+    for name, chosen in axes.items():
+        gap_k = np.abs(getattr(after, name) - getattr(state, name))[chosen]
+        assert np.max(gap_k) < 1e-3, name
+    stored = np.abs(result.liquid_stored_w / (1.0 + result.liquid_it_w))[holds]
+    assert np.max(stored) < 1e-4
+
+
 def test_rates_of_chips_and_loops() -> None:
     of_rack = {"leak_per_k": 0.0, "stagnant_w_per_k": 0.0, "trip_flow_share": 0.0}
     fleet = fleet_of(of_rack={**of_rack, "throttle_c": 1e6, "trip_c": 1e6})

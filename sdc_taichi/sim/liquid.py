@@ -48,7 +48,11 @@ TOWER_PASSES = 2
 """Repetitions of the kernel with the tower water for its heat; the first pass assumes the design
 approach."""
 PUMP_FAILURE_SUBSTEP_S, FAILURE_SUBSTEP_S = 1.0, 5.0
-"""Substeps of transient halls while pumps have failed, and during other failures, in s."""
+"""Substeps of transient halls without flow in the facility loop or with less than ``LEAST_FLOW`` in
+a manifold, and during other failures, in s."""
+LEAST_FLOW = 0.5
+"""Flow that the CDUs of a manifold can give, as a share of design, with the usual substeps of
+failures."""
 
 
 class LiquidCarry(Protocol):
@@ -231,6 +235,7 @@ class Liquid:
         self._income_per_w = self._per_dc(plants.heat_price_per_kwh) * (step_s / 3.6e6)
         self._cooler_approach_k = self._per_dc(plants.approach_k)
         self._size_towers()
+        self._design_m3s = np.bincount(fleet.rack_manifold, self.sizing.rack_m3s, loops)
         self._usual_substeps = np.ceil(step_s / self._per_dc(plants.substep_s))
         self._initial = LiquidState(
             cdu_setpoint_c=np.broadcast_to(cdus.setpoint_c, self._cdus).astype(np.float64),
@@ -383,19 +388,23 @@ class Liquid:
             rows[name][:] = 1.0 if values is None else values
         substeps = rows["substeps"]
         substeps[:] = self._usual_substeps
-        has_failure = rows["cooler_share"] < 1.0
+        has_failure = (rows["cooler_share"] < 1.0) | (rows["facility_pump"] < 1.0)
         if inputs.rack_valve is not None:
             shut = inputs.rack_valve <= 0.0
             rows["open"] *= inputs.rack_valve
             rows["powered"][shut] = 0.0
             has_failure[self.fleet.manifold_dc[self.fleet.rack_manifold[shut]]] = True
+        loop = self.fleet.cdu_manifold[(rows["up"] < 1.0) | (rows["pumps"] < 1.0)]
+        has_failure[self.fleet.manifold_dc[loop]] = True
         at_least = np.ceil(self._step_s / FAILURE_SUBSTEP_S)
         np.maximum(substeps, np.where(has_failure, at_least, 0.0), out=substeps)
-        short_of_pumps = rows["facility_pump"] < 1.0
-        loop = self.fleet.cdu_manifold[(rows["up"] < 1.0) | (rows["pumps"] < 1.0)]
-        short_of_pumps[self.fleet.manifold_dc[loop]] = True
+        loop = self.fleet.cdu_manifold
+        left_m3s = rows["up"] * rows["pumps"] * self.sizing.cdu_m3s
+        few = np.bincount(loop, left_m3s, self._loops) < LEAST_FLOW * self._design_m3s
+        short_of_flow = rows["facility_pump"] <= 0.0
+        short_of_flow[self.fleet.manifold_dc[few]] = True
         at_least = np.ceil(self._step_s / PUMP_FAILURE_SUBSTEP_S)
-        np.maximum(substeps, np.where(short_of_pumps, at_least, 0.0), out=substeps)
+        np.maximum(substeps, np.where(short_of_flow, at_least, 0.0), out=substeps)
 
     def _launch(self, state: LiquidCarry, transient: bool) -> None:
         """Run the kernel from a state."""
