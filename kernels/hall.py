@@ -289,15 +289,15 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     if ti.static(hall.transient):
         dc.exchanges_before = ti.cast(exchanges, ti.i32)
         dc.shift_k = ti.select(exchanges, 0.0, change_k)
-        dc.status = RUNNING
-        if is_last:
-            dc.status = DONE
         air.units_load_w, air.coil_w = run_coils(hall, n, units, air.units_return_c)
         air.casings_w = units.casings_w
         most_k = change_of_air(hall, n, total.least_change_k, total.most_change_k)
         if sweep > 0:
             most_k = ti.max(most_k, dc.most_change_k)
         dc.most_change_k = most_k
+        dc.status = RUNNING
+        if is_last or most_k > hall.abandoned_above_k:
+            dc.status = DONE
     else:
         if dc.adjusts_supply > 0.0:
             load_w = air.units_return_c * units.flow_m3s - units.supply_m3k_s

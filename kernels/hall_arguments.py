@@ -359,6 +359,7 @@ ARGUMENTS = {
     "substep_s": Argument("f64"),
     "weight": Argument("f64"),  # weight of a sweep in the results: 1 / substeps
     "tolerance_k": Argument("f64"),  # convergence: limit of the change of any mix
+    "abandoned_above_k": Argument("f64"),  # transient: change of the air that ends a step early, K
     # Indices of the items in the arrays.
     "task_offsets": _numbers("i32", 1),  # first chunk of each task, and the final end
     "dc_ints": _numbers("i32", 2, DC_INTS, "dcs"),
@@ -419,7 +420,8 @@ _LAYERS_ALONE = (
     *("inlet_vectors", "outlet_vectors", "power_vectors"),
 )
 _STEP_ALONE = (
-    *("sweeps", "load_columns", "substep_s", "weight", "tolerance_k", "task_offsets"),
+    *("sweeps", "load_columns", "substep_s", "weight", "tolerance_k", "abandoned_above_k"),
+    "task_offsets",
     *("run_offsets", "run_ints", "unit_inputs", "mix_weights", "run_weights", "steady_states"),
     *("sample_outlet_c", "mode_amounts", "mode_amount"),
     *("dc_control", "rack_state_by_4", "rack_state_by_16", "server_c_before", "server_c_after"),

@@ -49,20 +49,21 @@ def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
     dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
     n_blocks = hall.chunks[chunk_at + 1].first_block - chunk.first_block
-    unit = 0
+    unit, share_0 = 0, first_share_at(hall, n, chunk.first_block)
+    terms_end = block_terms_0 + n_blocks * N_BLOCK_TERMS
     while unit < n_units:
-        need_m3s, b = hall.zeros, 0
-        while b < n_blocks:
-            share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
-            need_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].fresh_m3s
-            b += hall.one
+        need_m3s, terms_at, share_at = hall.zeros, block_terms_0, share_0 + unit
+        while terms_at < terms_end:
+            need_m3s += hall.unit_shares[share_at] * hall.block_terms[terms_at].fresh_m3s
+            terms_at += N_BLOCK_TERMS
+            share_at += n_units
         hall.unit_need_m3s[chunk.first_need + unit] = sum_lanes(need_m3s)
         if dc.exceeds > 0.0:
-            plain_m3s, b = hall.zeros, 0
-            while b < n_blocks:
-                share = hall.unit_shares[first_share_at(hall, n, chunk.first_block + b) + unit]
-                plain_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].plain_m3s
-                b += hall.one
+            plain_m3s, terms_at, share_at = hall.zeros, block_terms_0, share_0 + unit
+            while terms_at < terms_end:
+                plain_m3s += hall.unit_shares[share_at] * hall.block_terms[terms_at].plain_m3s
+                terms_at += N_BLOCK_TERMS
+                share_at += n_units
             hall.unit_plain_m3s[chunk.first_need + unit] = sum_lanes(plain_m3s)
         unit += hall.one
 

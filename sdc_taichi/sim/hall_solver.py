@@ -415,7 +415,9 @@ class Hall:
         before = np.ascontiguousarray(state.server_c, self._dtype)
         after = np.empty(self._fleet.groups, self._dtype)
 
-        def advance(chosen: npt.NDArray[np.bool_], substeps: int) -> None:
+        def advance(
+            chosen: npt.NDArray[np.bool_], substeps: int, abandoned_above_k: float = np.inf
+        ) -> None:
             self._set_state(state, coil, chosen)
             self._begin_step(exchanges_before=1, chosen=chosen)
             self._run_sweeps(
@@ -424,6 +426,7 @@ class Hall:
                 transient=True,
                 substep_s=step_s / substeps,
                 weight=1.0 / substeps,
+                abandoned_above_k=abandoned_above_k,
                 server_c_before=before,
                 server_c_after=after,
             )
@@ -431,12 +434,16 @@ class Hall:
         def count(length_s: float) -> int:
             return int(np.ceil(step_s / length_s - 1e-9))
 
-        substeps = count(substep_s)
-        advance(np.ones(self._fleet.size, np.bool_), substeps)
-        if shortest_s is not None:
+        substeps, every_dc = count(substep_s), np.ones(self._fleet.size, np.bool_)
+        most = substeps if shortest_s is None else count(shortest_s)
+        if most <= substeps:
+            advance(every_dc, substeps)
+        else:
+            # A step that will be repeated with the shortest substeps need not be finished.
+            advance(every_dc, substeps, MOST_CHANGE_K * (np.ceil(most / substeps) - 1.0))
             ratio = np.ceil(self._dc["most_change_k"] / MOST_CHANGE_K)
             # Halls whose temperatures are not numbers are beyond all limits.
-            needed = np.nan_to_num(np.minimum(substeps * ratio, count(shortest_s)))
+            needed = np.nan_to_num(np.minimum(substeps * ratio, most))
             for finer in np.unique(needed[needed > substeps]).tolist():
                 advance(needed == finer, int(finer))
         return self._results(dc_out, transient=True), self._hall_state(after)
@@ -890,6 +897,7 @@ class Hall:
         sweeps: int = 1,
         substep_s: float = 1.0,
         weight: float = 1.0,
+        abandoned_above_k: float = np.inf,
         server_c_before: Any = None,
         server_c_after: Any = None,
     ) -> None:
@@ -908,6 +916,7 @@ class Hall:
             load_level=self._load_level,
             substep_s=substep_s,
             weight=weight,
+            abandoned_above_k=abandoned_above_k,
             group_load=self._group_load,
             server_c=self._server_c,
             server_c_before=self._none if server_c_before is None else server_c_before,
