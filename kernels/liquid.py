@@ -26,8 +26,8 @@ from .liquid_arguments import ARGUMENTS
 
 NEWTON_STEPS = 6
 """Most steps of Newton's method for a valve or fan."""
-NEWTON_TOLERANCE = 1e-10
-"""Relative step at which Newton's method ends; its error is then far smaller."""
+NEWTON_TOLERANCE = 1e-6
+"""Relative step with which Newton's method ends; it leaves an error of the square of it."""
 SWEEP_TOLERANCE_K = 1e-6
 """Change of supply temperatures at which sweeps end, in K."""
 MOST_FLOW = 1.1
@@ -152,6 +152,9 @@ def flow_for(liquid: ti.template(), wanted, ua, wall, side, c_s, y_s, c_f, low, 
         after = clip(at + (target - inverse) / slope, least, most)
         step += liquid.one
         if ti.abs(after - at) <= liquid.real(NEWTON_TOLERANCE) * at:
+            # The rest of the way is straight to full precision.
+            inverse += slope * (after - at)
+            at = after
             step = NEWTON_STEPS + 1
         if step <= NEWTON_STEPS:
             at = after
@@ -171,27 +174,27 @@ def relax(liquid: ti.template(), before_c, gain_w, w_per_k, to_c, j_per_k, dt):
 @no_type_check
 def _begin_step(liquid: ti.template(), dc):
     """Set the results that add up over a step to their first values."""
-    m = liquid.manifold_offsets[dc]
-    end = liquid.manifold_offsets[dc + 1]
-    r = liquid.rack_offsets[m]
-    while r < liquid.rack_offsets[end]:
-        rack = liquid.racks[r]
-        rack.runs = ti.select(rack.powered > 0.0, liquid.real(1.0), liquid.real(0.0))
-        rack.tripped = 0.0
-        rack.it_w = 0.0
-        rack.liquid_w = 0.0
-        rack.air_w = 0.0
-        rack.lost_utilisation = 0.0
-        rack.junction_max_c = -1000.0
-        r += liquid.one
+    m, end = liquid.manifold_offsets[dc], liquid.manifold_offsets[dc + 1]
     c = liquid.cdu_offsets[m]
     while c < liquid.cdu_offsets[end]:
-        cdu = liquid.cdus[c]
-        cdu.heat_w = 0.0
-        cdu.valve = 0.0
-        cdu.k_w_per_k = 0.0
+        liquid.cdus[c].heat_w = 0.0
+        liquid.cdus[c].valve = 0.0
         c += liquid.one
     while m < end:
+        on, r = liquid.real(0.0), liquid.rack_offsets[m]
+        while r < liquid.rack_offsets[m + 1]:
+            rack = liquid.racks[r]
+            runs = ti.select(rack.powered > 0.0, liquid.real(1.0), liquid.real(0.0))
+            on += runs
+            rack.runs = runs
+            rack.tripped = 0.0
+            rack.it_w = 0.0
+            rack.liquid_w = 0.0
+            rack.air_w = 0.0
+            rack.lost_utilisation = 0.0
+            rack.junction_max_c = -1000.0
+            r += liquid.one
+        liquid.loops[m].on = on
         liquid.loops[m].heat_w = 0.0
         liquid.loops[m].to_air_w = 0.0
         m += liquid.one
@@ -203,7 +206,7 @@ def _begin_step(liquid: ti.template(), dc):
     of_dc.trim_load_w = 0.0
     of_dc.taken_w = 0.0
     of_dc.heat_pump_w = 0.0
-    of_dc.evaporation_kg_s = 0.0
+    of_dc.evaporated_w = 0.0
     of_dc.stored_w = 0.0
     of_dc.throttle_s = -1.0
     of_dc.trip_s = -1.0
@@ -645,8 +648,8 @@ def _reuse(liquid: ti.template(), dc, water, into_c, heat_w):
         pass_ = 0
         # After an odd number of passes the heat delivered is below the demand.
         while pass_ < 3:
-            source_k = into_c - 0.5 * taken_w / water - of_dc.pinch_k + liquid.real(273.15)
-            cop = of_dc.lorenz * of_dc.sink_k / ti.max(of_dc.sink_k - source_k, LEAST_LIFT_K)
+            source_c = into_c - 0.5 * taken_w / water - of_dc.pinch_k
+            cop = of_dc.lorenz_k / ti.max(of_dc.sink_c - source_c, LEAST_LIFT_K)
             cop = ti.max(cop, LEAST_COP)
             power_w = taken_w / (cop - 1.0)
             if taken_w + power_w > of_dc.reuse_demand_w or taken_w < most_w:
@@ -716,7 +719,7 @@ def _add_facility(
     of_dc.taken_w = of_dc.taken_w + part * taken_w
     of_dc.heat_pump_w = of_dc.heat_pump_w + part * heat_pump_w
     evaporated_w = of_dc.cooler_air_w_per_k * z * (of_dc.dry_c - air_c)
-    of_dc.evaporation_kg_s = of_dc.evaporation_kg_s + part * evaporated_w / liquid.real(2.45e6)
+    of_dc.evaporated_w = of_dc.evaporated_w + part * evaporated_w
 
 
 @ti.func
@@ -730,7 +733,7 @@ def _settle_facility(liquid: ti.template(), dc, heat_w, water, wanted_c):
     of_dc.trim_load_w = 0.0
     of_dc.taken_w = 0.0
     of_dc.heat_pump_w = 0.0
-    of_dc.evaporation_kg_s = 0.0
+    of_dc.evaporated_w = 0.0
     supply_c, return_c = wanted_c, wanted_c
     if water > 0.0:
         all_w = heat_w + of_dc.facility_fluid_share * _facility_pump_w(liquid, dc, water)
@@ -757,15 +760,31 @@ def _advance(liquid: ti.template(), dc):
     """Advance a data center by the substeps of a step."""
     of_dc = liquid.dcs[dc]
     count = ti.cast(of_dc.substeps, ti.i32)
-    most_open, dt, part = _set_flows(liquid, dc), liquid.step_s / count, 1.0 / of_dc.substeps
-    i = 0
+    dt, part, most_open = liquid.step_s / count, 1.0 / of_dc.substeps, liquid.real(0.0)
+    i, trips = 0, 1
     while i < count:
-        time_s = dt * (i + 1)
-        trips = _substep(liquid, dc, most_open, dt, part, time_s)
         if trips > 0:
             most_open = _set_flows(liquid, dc)
+            _set_decays(liquid, dc, dt)
         i += liquid.one
+        trips = _substep(liquid, dc, most_open, dt, part, dt * i)
     of_dc.sweeps = count
+
+
+@ti.func
+@no_type_check
+def _set_decays(liquid: ti.template(), dc, dt):
+    """Set conductances of the chips, and how far a power warms them in a substep."""
+    r = liquid.rack_offsets[liquid.manifold_offsets[dc]]
+    while r < liquid.rack_offsets[liquid.manifold_offsets[dc + 1]]:
+        rack = liquid.racks[r]
+        if rack.gpus > 0.0:
+            k, j_per_k = rack.stagnant_w_per_k, rack.chips_j_per_k
+            if rack.m3s > 0.0:
+                k = rack.gpus / rack.r_k_per_w
+            rack.k_w_per_k = k
+            rack.k_per_w = dt / j_per_k * phi(liquid, k * dt / j_per_k)
+        r += liquid.one
 
 
 @ti.func
@@ -847,17 +866,12 @@ def _advance_rack(liquid: ti.template(), dc, r, supply_c, dt, part, time_s):
     it_w, junction_c = rest_w, supply_c
     if rack.gpus > 0.0:
         before_c, capture, idle_w = rack.junction_c, rack.capture_chip, rack.gpu_idle_w
-        heat_j_per_k, k = rack.chips_j_per_k, rack.stagnant_w_per_k
-        if rack.m3s > 0.0:
-            k = rack.gpus / rack.r_k_per_w
-        decay = phi(liquid, k * dt / heat_j_per_k)
+        to_coolant_w = rack.k_w_per_k * (before_c - supply_c)
         gpus_w = liquid.real(0.0)
         if powered > 0.0:
             base_w = idle_w + rack.gpu_span_w * u
             free_w = base_w * (1.0 + rack.leak_per_k * (before_c - rack.leak_ref_c))
-            at_limit_w = k * (before_c - supply_c) + (rack.throttle_c - before_c) * (
-                heat_j_per_k / (dt * decay)
-            )
+            at_limit_w = to_coolant_w + (rack.throttle_c - before_c) / rack.k_per_w
             most_w = ti.max(at_limit_w / (capture * powered * rack.gpus), idle_w)
             if free_w > most_w and of_dc.throttle_s < 0.0:
                 of_dc.throttle_s = time_s
@@ -867,9 +881,8 @@ def _advance_rack(liquid: ti.template(), dc, r, supply_c, dt, part, time_s):
                 rack.lost_utilisation = rack.lost_utilisation + part * powered * u * (1.0 - clock)
             gpus_w = powered * rack.gpus * power_w
         gain_w = capture * gpus_w
-        rate = (gain_w - k * (before_c - supply_c)) / heat_j_per_k
-        junction_c = before_c + rate * dt * decay
-        stored_w = heat_j_per_k * (junction_c - before_c) / dt
+        junction_c = before_c + (gain_w - to_coolant_w) * rack.k_per_w
+        stored_w = rack.chips_j_per_k * (junction_c - before_c) / dt
         of_dc.stored_w = of_dc.stored_w + part * stored_w
         to_liquid_w += gain_w - stored_w
         air_w += gpus_w - gain_w
@@ -919,17 +932,6 @@ def _advance_facility(liquid: ti.template(), dc, heat_w, water, dt, part):
 
 @ti.func
 @no_type_check
-def _racks_with_power(liquid: ti.template(), m):
-    """Return the number of racks of a manifold that have power in the step."""
-    count, r = liquid.real(0.0), liquid.rack_offsets[m]
-    while r < liquid.rack_offsets[m + 1]:
-        count += ti.select(liquid.racks[r].powered > 0.0, liquid.real(1.0), liquid.real(0.0))
-        r += liquid.one
-    return count
-
-
-@ti.func
-@no_type_check
 def _finish_step(liquid: ti.template(), dc):
     """Sum the results of racks and manifolds, and share the heat of pipes and pumps out.
 
@@ -942,17 +944,16 @@ def _finish_step(liquid: ti.template(), dc):
     warmed_w = (1.0 - of_dc.facility_fluid_share) * of_dc.facility_pump_w
     air_w, all_on, m = warmed_w, liquid.real(0.0), first
     while m < end:
-        on = _racks_with_power(liquid, m)
-        if on == 0.0:
+        if liquid.loops[m].on == 0.0:
             warmed_w += liquid.loops[m].to_air_w
-        all_on += on
+        all_on += liquid.loops[m].on
         m += liquid.one
     of_each_w = warmed_w / ti.max(all_on, 1.0)
     supply, back, rate = liquid.real(0.0), liquid.real(0.0), liquid.real(0.0)
     m = first
     while m < end:
         loop = liquid.loops[m]
-        extra_w = of_each_w + loop.to_air_w / ti.max(_racks_with_power(liquid, m), 1.0)
+        extra_w = of_each_w + loop.to_air_w / ti.max(loop.on, 1.0)
         air_w += loop.to_air_w
         r = liquid.rack_offsets[m]
         while r < liquid.rack_offsets[m + 1]:

@@ -45,8 +45,10 @@ RACK_OUT = {
     "m3s": "flow of coolant, in m3/s",
     "runs": "1 while the rack has not switched off, else 0",
     "r_k_per_w": "junction minus coolant temperature per W of a GPU, in K/W",
+    "k_w_per_k": "conductance between all GPUs and their coolant, in W/K",
+    "k_per_w": "rise of the junctions in a substep per W of all GPUs, in K/W",
 }
-"""Results of each rack, the last two only used within the kernel."""
+"""Results of each rack, those after the flow only used within the kernel."""
 CDU_COEFFICIENTS = {
     "design_m3s": "flow of coolant at design, in m3/s",
     "ua_w_per_k": "UA of the exchanger at design, in W/K",
@@ -85,6 +87,7 @@ LOOP_STATE = {
 LOOP_OUT = {
     "w_per_k": "heat capacity rate of the coolant, in W/K",
     "wanted_c": "mean setpoint of the CDUs by flow, in C",
+    "on": "number of racks that have power in the step",
     "least_c": "lowest setpoint of the CDUs that run, in C",
     "flow_per_rack": "flow of a rack with an open valve, as a share of its design",
     "loss_w_per_k": "heat that pipes lose for each kelvin of return minus room, in W/K",
@@ -120,8 +123,8 @@ DC_COEFFICIENTS = {
     "reuse_demand_w": "largest heat that the consumer takes, in W",
     "reuse_effectiveness": "effectiveness of the exchanger of direct reuse",
     "network_return_c": "water of the consumer before it is heated, in C",
-    "sink_k": "mean temperature of the heat pump's sink with pinch, in K",
-    "lorenz": "COP of the heat pump divided by that of a Lorenz process",
+    "sink_c": "mean temperature of the heat pump's sink with pinch, in C",
+    "lorenz_k": "COP of the heat pump times its temperature lift, in K",
     "pinch_k": "temperature difference in the heat pump's exchangers, in K",
 }
 """Constants of each data center."""
@@ -155,12 +158,12 @@ DC_OUT = {
     "trim_load_w": "mean heat that the trim chiller takes, in W",
     "taken_w": "mean heat that reuse takes from facility water, in W",
     "heat_pump_w": "mean power of the heat pump, in W",
-    "evaporation_kg_s": "mean evaporation of wet pads, in kg/s",
+    "evaporated_w": "mean heat of evaporation of the water of wet pads, in W",
     "stored_w": "mean rate of heat stored in chips and loops, in W",
     "facility_setpoint_c": "setpoint of the facility water, in C",
     "throttle_s": "time of the first throttling, in s; -1 without",
     "trip_s": "time of the first trip, in s; -1 without",
-    "sweeps": "number of sweeps of steady air, or substeps",
+    "sweeps": "number of sweeps, or of substeps",
 }
 """Results of each data center."""
 ARGUMENTS = {

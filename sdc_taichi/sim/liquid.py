@@ -231,7 +231,8 @@ class Liquid:
         self._is_tower = rejection == _TOWER
         self._trims = bool(np.any(self._per_dc(plants.trim_w) > 0.0))
         self._trim_w, self._trim_cop = self._per_dc(plants.trim_w), self._per_dc(plants.trim_cop)
-        self._water_per_kg = self._per_dc(plants.cycles) / (self._per_dc(plants.cycles) - 1.0)
+        cycles = self._per_dc(plants.cycles)
+        self._litres_per_w = step_s / EVAPORATION_HEAT_J_PER_KG * cycles / (cycles - 1.0)
         self._income_per_w = self._per_dc(plants.heat_price_per_kwh) * (step_s / 3.6e6)
         self._cooler_approach_k = self._per_dc(plants.approach_k)
         self._size_towers()
@@ -472,11 +473,10 @@ class Liquid:
         _, cdu = self._rows_out("cdu", spec.CDU_OUT)
         _, rack = self._rows_out("rack", spec.RACK_OUT)
         zeros, states = np.zeros(self._size), self._arrays["dc_state"].copy()
-        fan_w, evaporation_kg_s = dc["cooler_fan_w"], dc["evaporation_kg_s"]
+        fan_w, evaporated_w = dc["cooler_fan_w"], dc["evaporated_w"]
         if self._has_towers:
             fan_w = np.where(self._is_tower, self._tower(inputs).fan_w, fan_w)
-            by_tower = np.maximum(dc["cooler_w"], 0.0) / EVAPORATION_HEAT_J_PER_KG
-            evaporation_kg_s = np.where(self._is_tower, by_tower, evaporation_kg_s)
+            evaporated_w = np.where(self._is_tower, np.maximum(dc["cooler_w"], 0.0), evaporated_w)
         chiller_w = self._trim_chiller_w(dc, inputs) if self._trims else zeros
         reuse_w = dc["taken_w"] + dc["heat_pump_w"]
         return LiquidResult(
@@ -498,7 +498,7 @@ class Liquid:
             reuse_w=reuse_w,
             liquid_rejected_w=dc["cooler_w"] + dc["trim_load_w"] + chiller_w,
             liquid_stored_w=dc["stored_w"],
-            cooler_water_l=evaporation_kg_s * self._water_per_kg * self._step_s,
+            cooler_water_l=evaporated_w * self._litres_per_w,
             leak_l=zeros if inputs.leak_l is None else inputs.leak_l,
             heat_income=self._income_per_w * reuse_w,
             throttle_s=dc["throttle_s"],
@@ -606,6 +606,7 @@ class Liquid:
 
     def _dc_coefficients(self) -> dict[str, Values]:
         p, sizes = self.fleet.plants, self.sizing
+        sink_c = 0.5 * np.add(p.network_return_c, p.network_supply_c) + p.pinch_k
         return {
             "j_per_m3_k": np.multiply(p.density_kg_m3, p.heat_capacity_j_per_kg_k),
             "room_c": p.room_c,
@@ -626,7 +627,7 @@ class Liquid:
             "reuse_demand_w": p.reuse_demand_w,
             "reuse_effectiveness": p.reuse_effectiveness,
             "network_return_c": p.network_return_c,
-            "sink_k": 0.5 * np.add(p.network_return_c, p.network_supply_c) + p.pinch_k + KELVIN,
-            "lorenz": p.lorenz,
+            "sink_c": sink_c,
+            "lorenz_k": p.lorenz * (sink_c + KELVIN),
             "pinch_k": p.pinch_k,
         }
