@@ -1,5 +1,6 @@
 """Public names of the package; each is imported from its module on first use."""
 
+from . import compat as compat
 from .config import DataCenterConfig as DataCenterConfig
 from .config import load_config as load_config
 from .config import preset_names as preset_names

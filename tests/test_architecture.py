@@ -32,6 +32,7 @@ ROOMS = (
     "run",
     "viz",
     "envs",
+    "compat",
     "learning",
     "benchmark",
     "cli",
@@ -101,7 +102,7 @@ def test_there_are_few_rooms_and_each_has_its_place() -> None:
     rooms = {room_of(module) for module in FILES}
     assert rooms <= set(ROOMS), "say in ROOMS what the new room may import"
     assert set(ROOMS) <= rooms, "a room of ROOMS is gone"
-    assert len(rooms - {*MAPPED, "__main__"}) <= 20
+    assert len(rooms - {*MAPPED, "__main__"}) <= 21
 
 
 @pytest.mark.parametrize("module", FILES)

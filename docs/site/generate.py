@@ -103,8 +103,10 @@ API = (
                     *("vector_env", "parallel_env", "aec_env", "hall_env", "HallFamily"),
                     *("EnvOptions", "EndedBy"),
                     *("register_reward", "register_cost", "RecordEpisodes", "EpisodeRecorder"),
+                    "compat",
                 ],
-            )
+            ),
+            ("sdc_taichi.compat", ["SustainDC"]),
         ],
     ),
     Part(
@@ -332,8 +334,14 @@ def documented(part: Part) -> list[tuple[str, str]]:
     return [(module, name) for name, module in found.items()]
 
 
+MODULES = ("compat",)
+"""Public names that are modules."""
+
+
 def kind_of(name: str) -> str:
     """What a name is of, as its letters tell it; nothing is imported, as not all is installed."""
+    if name in MODULES:
+        return "module"
     if name.isupper():
         return "data"
     if name.endswith(("Error", "Warning")):

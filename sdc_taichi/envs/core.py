@@ -52,9 +52,10 @@ from sdc_taichi.envs.episodes import (
 )
 from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.images import heat_map, heat_map_space
-from sdc_taichi.envs.observer import make_observer
+from sdc_taichi.envs.observer import Observer, make_observer
 from sdc_taichi.envs.options import ConfigDraw, EnvOptions
 from sdc_taichi.envs.recording import EpisodeRecordings, RecorderOption
+from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.unit_slots import slots_of_groups
 from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
@@ -551,8 +552,8 @@ class Core:
         return by_env
 
     @property
-    def observer(self) -> Any:
-        """Observer that computes the observations."""
+    def observer(self) -> Observer | ReleasedObserver:
+        """The observer, which computes the observations."""
         return self._observer
 
     @property
