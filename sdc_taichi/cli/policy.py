@@ -1,9 +1,9 @@
-"""``sdc-taichi policy``: describe a policy, or export it as an ONNX model."""
+"""``sdc-taichi policy``: describe, import or export a policy."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,7 +13,7 @@ from sdc_taichi.errors import printable
 if TYPE_CHECKING:
     from sdc_taichi.learning.policy import Policy
 
-policy_app = CommandApp(help="Show and export policies.", no_args_is_help=True)
+policy_app = CommandApp(help="Show, import and export policies.", no_args_is_help=True)
 Folder = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Folder of a training run, or of a policy.")
 ]
@@ -52,6 +52,33 @@ def export_policy(
     fits = policy.interface
     inputs = [agent for group in fits.agents for agent in fits.policies_of(group)]
     print(f"{printable(out)}: inputs {', '.join(inputs)}")
+
+
+@policy_app.command("import")
+def import_policy(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE.pt...", help="Weights of actors that HARL has stored."),
+    ],
+    out: Annotated[Path, out_option("Folder of the policy to write.", "FOLDER")],
+    agents: Annotated[
+        str, typer.Option("--agents", help="Agents of the files, in the same order.")
+    ] = "agent_ls,agent_dc,agent_bat",
+    activation: Annotated[
+        Literal["tanh", "relu"],
+        typer.Option("--activation", help="Activation function of the actors."),
+    ] = "tanh",
+    force: Annotated[bool, force_option()] = False,
+) -> None:
+    """Convert actors that HARL has trained on SustainDC to a policy."""
+    from sdc_taichi.learning.import_harl import import_harl
+    from sdc_taichi.learning.policy import WEIGHTS
+
+    check_out_file(out / WEIGHTS, ".safetensors", force=force)
+    names = [name.strip() for name in agents.split(",")]
+    policy = import_harl(files, names, activation)
+    policy.save(out)
+    print(f"{printable(out)}: policy of {', '.join(policy.interface.agents)}")
 
 
 def _origin(policy: Policy) -> str:

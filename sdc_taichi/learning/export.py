@@ -67,6 +67,8 @@ def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetw
     x = graph.node("Sub", x, graph.constant(network.mean))
     x = graph.node("Div", x, graph.constant(network.std))
     x = _between(graph, x, network.clip)
+    if network.norms:
+        raise ConfigError("policy: has layer normalisations; valid for ONNX is one without them")
     activation = {"tanh": "Tanh", "relu": "Relu"}[network.activation]
     for i, (weight, bias) in enumerate(network.layers):
         x = graph.node("Gemm", x, graph.constant(weight), graph.constant(bias), transB=1)

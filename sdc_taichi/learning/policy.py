@@ -52,6 +52,13 @@ MOST_DECISION_STEPS = 96
 """Maximum number of steps from one decision to the next."""
 Activation = Literal["tanh", "relu"]
 """Activation function of hidden layers."""
+Hidden = Literal["tanh", "relu", "tanh_normalised", "relu_normalised"]
+"""Activation function of hidden layers; ``normalised`` if a layer normalisation follows each
+hidden layer, and precedes the first."""
+NORMALISED: dict[Activation, Hidden] = {"tanh": "tanh_normalised", "relu": "relu_normalised"}
+"""Name of each activation function if layer normalisations follow it."""
+NORM_EPSILON = 1e-5
+"""Summand of the variance in a layer normalisation (the default of PyTorch)."""
 SERIAL_PRODUCTS = 2_000_000
 """Number of multiplications per call up to which one thread is faster than several."""
 Head = Literal["argmax", "clip", "tanh"]
@@ -85,12 +92,16 @@ class PolicyNetwork:
     """Maximum absolute value of a normalised entry; larger values are clipped."""
     layers: tuple[tuple[F32, F32], ...]
     """Weight, (out, in), and bias, (out,), of each layer."""
-    activation: Activation
+    activation: Hidden
     """Activation function of all layers except the last."""
     head: Head
     """Function that maps the outputs of the last layer to actions."""
     choices: int = CHOICES
     """Number of options, and so of scores, of each action with head ``argmax``."""
+    norms: tuple[tuple[F32, F32], ...] = ()
+    """Weight and bias, (width,) each, of the layer normalisation before each layer, with an
+    activation that is ``normalised``; otherwise empty. The first may be wider than the observation,
+    which is then padded with zeros."""
 
     def __post_init__(self) -> None:
         """Check shapes and values, and convert the arrays to read-only f32 copies."""
@@ -102,8 +113,21 @@ class PolicyNetwork:
             )
         if not 0.0 < self.clip <= float(np.finfo(np.float32).max):
             raise SdcError(f"{who}: clip {self.clip}; valid is a positive number of f32")
-        layers, width = [], len(mean)
+        layers, norms, width = [], [], len(mean)
+        if len(self.norms) != (len(self.layers) if self.activation in NORMALISED.values() else 0):
+            raise SdcError(f"{who}: {len(self.norms)} layer normalisations for {self.activation}")
         for i, arrays in enumerate(self.layers):
+            if self.norms:
+                scale = _numbers(self.norms[i][0], f"{who}: weight of norm {i}", 1)
+                shift = _numbers(self.norms[i][1], f"{who}: bias of norm {i}", 1)
+                fits = len(scale) >= width if i == 0 else len(scale) == width
+                if not fits or scale.shape != shift.shape:
+                    raise SdcError(
+                        f"{who}: norm {i} has weight {scale.shape} and bias {shift.shape} after "
+                        f"{width} units; valid is ({width},) each"
+                    )
+                norms.append((scale, shift))
+                width = len(scale)
             weight = _numbers(arrays[0], f"{who}: weight of layer {i}", 2)
             bias = _numbers(arrays[1], f"{who}: bias of layer {i}", 1)
             if not len(bias) or weight.shape != (len(bias), width):
@@ -117,8 +141,9 @@ class PolicyNetwork:
             raise SdcError(
                 f"{who}: {width} outputs; valid is a multiple of {self.choices} for argmax"
             )
-        for name, value in (("mean", mean), ("std", std), ("layers", tuple(layers))):
-            object.__setattr__(self, name, value)
+        arrays_by_name = {"mean": mean, "std": std, "layers": layers, "norms": norms}
+        for name, value in arrays_by_name.items():
+            object.__setattr__(self, name, tuple(value) if isinstance(value, list) else value)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -151,8 +176,40 @@ class PolicyNetwork:
         return np.asarray(np.tanh(scores) if self.head == "tanh" else np.clip(scores, -1.0, 1.0))
 
     @cached_property
-    def _forward(self) -> Forward:
-        return Forward(self.mean, self.std, self.clip, self.layers, self.activation)
+    def _forward(self) -> Forward | NormalisedForward:
+        if self.activation == "tanh" or self.activation == "relu":
+            return Forward(self.mean, self.std, self.clip, self.layers, self.activation)
+        return NormalisedForward(self)
+
+
+class NormalisedForward:
+    """Forward pass of a perceptron with layer normalisations, in NumPy.
+
+    Args:
+        network: the network.
+    """
+
+    def __init__(self, network: PolicyNetwork) -> None:
+        self._network = network
+
+    def __call__(self, inputs: F32) -> F32:
+        """Return the outputs, (B, outputs), for inputs, (B, n)."""
+        network = self._network
+        x = (inputs.astype(np.float64) - network.mean) / network.std
+        x = np.minimum(np.maximum(x, -network.clip), network.clip)
+        x = np.pad(x, ((0, 0), (0, len(network.norms[0][0]) - x.shape[1])))
+        for i, ((scale, shift), (weight, bias)) in enumerate(
+            zip(network.norms, network.layers, strict=True)
+        ):
+            if i > 0:
+                x = np.tanh(x) if network.activation == "tanh_normalised" else np.maximum(x, 0.0)
+            deviation = x - x.mean(axis=1, keepdims=True)
+            variance = np.square(deviation).mean(axis=1, keepdims=True)
+            x = deviation / np.sqrt(variance + NORM_EPSILON) * scale + shift
+            # Unlike a matrix product, this sums the products of each row in the same order in any
+            # batch.
+            x = np.einsum("bi,oi->bo", x, weight.astype(np.float64)) + bias
+        return np.asarray(x, dtype=np.float32)
 
 
 class Forward:
@@ -465,7 +522,7 @@ class _NetworkDescription(Section):
 
     agents: tuple[str, ...]
     sizes: tuple[int, ...] = Field(min_length=2)
-    activation: Activation
+    activation: Hidden
     clip: float = Field(gt=0, allow_inf_nan=False)
     head: Head
     choices: int = Field(ge=2)
@@ -486,6 +543,8 @@ def _tensors(network: PolicyNetwork) -> dict[str, F32]:
     arrays = {"mean": network.mean, "std": network.std}
     for i, (weight, bias) in enumerate(network.layers):
         arrays |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    for i, (weight, bias) in enumerate(network.norms):
+        arrays |= {f"norms.{i}.weight": weight, f"norms.{i}.bias": bias}
     return arrays
 
 
@@ -503,10 +562,16 @@ def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any
         (take(f"layers.{i}.weight"), take(f"layers.{i}.bias"))
         for i in range(len(described.sizes) - 1)
     )
+    is_normalised = described.activation in NORMALISED.values()
+    norms = tuple(
+        (take(f"norms.{i}.weight"), take(f"norms.{i}.bias"))
+        for i in range(len(layers) if is_normalised else 0)
+    )
     network = PolicyNetwork(
         mean=take("mean"),
         std=take("std"),
         layers=layers,
+        norms=norms,
         **described.model_dump(exclude={"sizes"}),
     )
     if network.sizes != described.sizes:
