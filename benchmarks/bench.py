@@ -43,6 +43,8 @@ LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo")
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
 QUICK_SIZES = ((4, 20, 200), (1, 400, 40))
 """Data centers, racks of each and servers of a rack of the halls beside the peer."""
+LC_OPT_STEP_S, LC_OPT_STEPS_PER_S = 15.0, 61.0
+"""Length of a step of LC-Opt, whose Modelica model is one data center, and its highest speed."""
 CURVE = (3, 25, 250, 2500, 25_000)
 """Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
 
@@ -240,6 +242,21 @@ def halls(quick: bool) -> Iterator[Figure]:
     beside = f"{number(1e3 * wall_s(sim.step, 1 if quick else 10))} ms/step"
     name = f"{sim.fleet.racks:,} racks, over the memory roof"
     yield Figure("halls", name, ratio, at_most=2.0, absolute=beside)
+
+
+def liquid(quick: bool) -> Iterator[Figure]:
+    """Transient coolant loops alone, with five CDUs of three racks as in LC-Opt."""
+    count, step_s = (2, 60.0) if quick else (4096, 900.0)
+    step = steps.coolant_step(count, step_s)
+    ratio = core_ratios({"step": step}, interpreter_loop(), 1 if quick else 5)["step"]
+    per_s = count * step_s / LC_OPT_STEP_S / wall_s(step, 1 if quick else 3)
+    where = f"{count:,} data centers, {step_s:g} s"
+    beside = f"{number(per_s)} steps of {LC_OPT_STEP_S:g} s/s"
+    over = f"{where}, over the interpreter yardstick"
+    yield Figure("liquid", over, ratio, at_most=2500.0, absolute=beside)
+    faster = per_s / LC_OPT_STEPS_PER_S
+    note = "LC-Opt was measured on another machine"
+    yield Figure("liquid", f"{where}: speed over LC-Opt", faster, at_least=1000.0, note=note)
 
 
 def calls(quick: bool) -> Iterator[Figure]:
@@ -572,7 +589,7 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    parts = environments, planned, kernel_and_peer, halls, calls, scaling, starting, optima
+    parts = environments, planned, kernel_and_peer, halls, liquid, calls, scaling, starting, optima
     for part in (*parts, recording, large_recording, rack_histories):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)

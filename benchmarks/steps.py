@@ -11,8 +11,10 @@ import sdc_taichi
 from sdc_taichi.config import with_values
 from sdc_taichi.control import view_maker
 from sdc_taichi.kernels.compiler.launch import BoundKernel
+from sdc_taichi.plant.liquid import LiquidFleet
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.liquid import Liquid, LiquidInputs
 from sdc_taichi.types import I32, StepResult
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
@@ -219,3 +221,22 @@ def environment_step(size: int) -> Callable[[], object]:
     for _ in range(3):
         env.step(actions)
     return lambda: env.step(actions)
+
+
+def coolant_step(count: int, step_s: float) -> Callable[[], object]:
+    """A step of transient coolant loops: five CDUs in each data center, each with three racks."""
+    fleet = LiquidFleet.of_equal(count, racks=3, cdus=1, manifolds=5)
+    racks = len(fleet.rack_manifold)
+    loops = Liquid(fleet, step_s=step_s, transient=True)
+    inputs = LiquidInputs(
+        np.random.default_rng(0).uniform(0.0, 1.0, racks),
+        np.ones(racks),
+        *(np.full(count, celsius) for celsius in (20.0, 15.0, 10.0)),
+    )
+    state = loops.initial_state(inputs)
+
+    def step() -> None:
+        nonlocal state
+        state, _ = loops.step(state, inputs)
+
+    return step

@@ -43,7 +43,7 @@ def test_all_parts_are_measured_and_speed_is_judged_by_ratios(written: dict[str,
     figures, machine = written["figures"], written["machine"]
     assert machine["cpu"]
     assert len(machine["roof_gb_per_s_and_core"]) == 2
-    parts = "kernel halls calls environments optima planned scaling start recording"
+    parts = "kernel halls liquid calls environments optima planned scaling start recording"
     assert {f["part"] for f in figures} == set(parts.split())
     assert len({f["name"] for f in figures}) == len(figures)
     for figure in figures:

@@ -21,7 +21,7 @@ from field_tables import settings_markdown, suite_markdown
 from stage import write
 
 from sdc_taichi.cli.app import app
-from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
+from sdc_taichi.types import CDUS, CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
 
 FOLDER = "reference/generated"
 """Folder of the generated pages on the site."""
@@ -260,12 +260,12 @@ def plain(text: str) -> str:
 
 def quantities_page() -> str:
     """Every quantity of ``StepResult``."""
-    axes = {DATA_CENTERS: "data center", CRAC_UNITS: "CRAC unit", RACKS: "rack"}
+    axes = {DATA_CENTERS: "data center", CRAC_UNITS: "CRAC unit", CDUS: "CDU", RACKS: "rack"}
     lines = [
         "# Quantities of a step",
         "",
-        "Every quantity of `StepResult`: an array with one entry per data center, CRAC unit or "
-        "rack. Those per data center are the columns of `steps.parquet` ([files of a run]"
+        "Every quantity of `StepResult`: an array with one entry per data center, CRAC unit, "
+        "CDU or rack. Those per data center are the columns of `steps.parquet` ([files of a run]"
         "(../../run-folder.md)). Powers are means over the step; energies, volumes and tasks are "
         "totals of the step.",
         "",
