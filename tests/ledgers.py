@@ -49,6 +49,11 @@ def stocks(state: State) -> dict[str, F64]:
     }
 
 
+def started(result: StepResult) -> F64:
+    """Work that starts in a step, in tasks, (B,)."""
+    return np.asarray(100.0 * result.utilisation)
+
+
 def quantities(fleet: Fleet, result: StepResult) -> dict[str, F64]:
     """All quantities of a step, and sums over the racks, (B,)."""
     first = fleet.rack_offsets[:-1]
@@ -57,7 +62,16 @@ def quantities(fleet: Fleet, result: StepResult) -> dict[str, F64]:
         getattr(result, f"rack_{name}").astype(np.float64)
         for name in ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "outlet_c")
     )
+    liquid_w = np.zeros(fleet.racks)
+    liquid_w[fleet.liquid_racks] = rack_cpu[fleet.liquid_racks]
     return result.per_dc() | {
+        # Throttled work for which the queue has no room is a part of the lost work.
+        "unplaced_tasks": np.clip(
+            result.throttled_tasks + result.lost_tasks + result.executed_tasks - started(result),
+            0.0,
+            None,
+        ),
+        "liquid_racks_w": np.add.reduceat(liquid_w, first),
         "racks_cpu_w": np.add.reduceat(rack_cpu, first),
         "racks_fan_w": np.add.reduceat(rack_fan, first),
         "racks_airflow_m3s": np.add.reduceat(rack_flow, first),
@@ -67,6 +81,11 @@ def quantities(fleet: Fleet, result: StepResult) -> dict[str, F64]:
 
 Ledger = Callable[[Run], list[F64]]
 """The terms of a balance with their signs, each (T, B); they add up to zero."""
+
+
+def air_w(run: Run) -> F64:
+    """Heat of servers, and of the lines and pumps of liquid cooling, in the hall's air, (T, B)."""
+    return np.asarray(run["it_w"] - run["liquid_racks_w"] + run["liquid_air_w"])
 
 
 def pump_heat_w(run: Run) -> F64:
@@ -93,7 +112,7 @@ def concentrating_l(run: Run) -> F64:
 
 LEDGERS: dict[str, Ledger] = {
     "heat": lambda r: [
-        r.kwh("it_w"),
+        air_w(r) * r.step_h / 1e3,
         r.kwh("crac_fan_w"),
         -r.kwh("thermal_storage_w"),
         -r.kwh("heat_removed_w"),
@@ -106,10 +125,10 @@ LEDGERS: dict[str, Ledger] = {
         -r["unmet_w"],
         r["recovered_w"],
     ],
-    "coils": lambda r: [r["cooling_load_w"], -r["it_w"], -r["crac_fan_w"], r["thermal_storage_w"]],
-    "server air": lambda r: [r["it_w"], -r["racks_air_w"]],
+    "coils": lambda r: [r["cooling_load_w"], -air_w(r), -r["crac_fan_w"], r["thermal_storage_w"]],
+    "server air": lambda r: [air_w(r), -r["racks_air_w"]],
     "room air": lambda r: [
-        r["it_w"],
+        air_w(r),
         -r.air_j_per_m3_k * r["crac_flow_m3s"] * (r["return_c"] - r["supply_c"]),
     ],
     "cooling": lambda r: [
@@ -137,6 +156,7 @@ LEDGERS: dict[str, Ledger] = {
         r["deferred_tasks"],
         -r["drained_tasks"],
         r["overdue_tasks"] - r["due_tasks"],
+        r["throttled_tasks"] - r["unplaced_tasks"],
         -r["queue_tasks"],
     ],
     "battery": lambda r: [
@@ -167,6 +187,22 @@ LEDGERS: dict[str, Ledger] = {
         -r["chilled_pump_w"],
         -r["condenser_pump_w"],
         -r["crac_fan_w"],
+        -r["cdu_pump_w"],
+        -r["facility_pump_w"],
+        -r["cooler_fan_w"],
+        -r["trim_chiller_w"],
+        -r["heat_pump_w"],
+    ],
+    "liquid": lambda r: [
+        r["liquid_racks_w"],
+        r["cdu_pump_w"],
+        r["facility_pump_w"],
+        r["trim_chiller_w"],
+        r["heat_pump_w"],
+        -r["liquid_air_w"],
+        -r["reuse_w"],
+        -r["liquid_rejected_w"],
+        -r["liquid_stored_w"],
     ],
     "overhead": lambda r: [
         r["overhead_w"],
@@ -175,7 +211,14 @@ LEDGERS: dict[str, Ledger] = {
         -r["distribution_loss_w"] * r.counts_losses,
     ],
     "cost": lambda r: [r["energy_cost"], -r["grid_kwh"] * r["price_per_kwh"]],
-    "water": lambda r: [r["water_l"], -r["evaporation_l"], -r["drift_l"], -r["blowdown_l"]],
+    "water": lambda r: [
+        r["water_l"],
+        -r["evaporation_l"],
+        -r["drift_l"],
+        -r["blowdown_l"],
+        -r["cooler_water_l"],
+        -r["leak_l"],
+    ],
     "blowdown": lambda r: [
         concentrating_l(r),
         # Without heat to evaporate water, drift alone thins what is left.

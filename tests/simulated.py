@@ -16,6 +16,7 @@ from sdc_taichi import (
     StepResult,
     drivers_from_arrays,
 )
+from sdc_taichi.types import QUANTITIES
 
 
 def short_drivers(size: int = 1, steps: int = 96, seed: int = 0) -> Drivers:
@@ -63,12 +64,17 @@ def part_of(result: StepResult, configs: Sequence[DataCenterConfig], index: int)
     """What one data center did in a step of a fleet."""
     racks = np.cumsum([0, *(c.hall.racks for c in configs)])
     units = np.cumsum([0, *(c.hvac.crac.units for c in configs)])
-    firsts = {"rack": racks, "unit": units}
+    cdus = [
+        0 if c.liquid is None else c.liquid.cdus.manifolds * c.liquid.cdus.per_manifold
+        for c in configs
+    ]
+    firsts = {"R": racks, "U": units, "C": np.cumsum([0, *cdus])}
     values: dict[str, Any] = {}
     for f in fields(result):
         value = getattr(result, f.name)
         if isinstance(value, np.ndarray):
-            first = firsts.get(f.name.split("_")[0], np.arange(len(configs) + 1))
+            axis = QUANTITIES[f.name].axis if f.name in QUANTITIES else "B"
+            first = firsts.get(axis, np.arange(len(configs) + 1))
             value = value[first[index] : first[index + 1]]
         values[f.name] = value
     return StepResult(**values)

@@ -17,7 +17,14 @@ from sdc_taichi.config import (
     load_config,
 )
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.sim.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule, seeds_of_fleet
+from sdc_taichi.sim.events import (
+    HOURS_PER_BLOCK,
+    ActiveEvent,
+    Places,
+    Timeline,
+    schedule,
+    seeds_of_fleet,
+)
 
 BASE = load_config("corrected")
 HOURLY = "{kind: grid_outage, per_year: 8760, duration_h: [1, 2]}"
@@ -41,10 +48,15 @@ def timeline(
     steps_per_hour: int = 4,
     seed: int = 7,
 ) -> Timeline:
+    rack_offsets = np.cumsum([0, *(racks or (3,) * len(configs))])
     return schedule(
         configs,
-        rack_offsets=np.cumsum([0, *(racks or (3,) * len(configs))]),
-        unit_offsets=np.cumsum([0, *(units or (2,) * len(configs))]),
+        Places(
+            rack_offsets,
+            np.cumsum([0, *(units or (2,) * len(configs))]),
+            2 * np.arange(len(configs) + 1),
+            rack_offsets[:-1],
+        ),
         steps_per_hour=steps_per_hour,
         seed=seed,
     )
@@ -83,7 +95,12 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         scheduled("pump_down", 7.0, 1.0, share=0.5),
         scheduled("tower_cell_down", 8.0, 1.0, share=0.75),
         scheduled("tank_down", 9.0, 1.0, share=0.25),
-        scheduled("link_down", 10.0, 1.0),
+        scheduled("link_down", 16.0, 1.0),
+        scheduled("facility_pump_down", 10.0, 1.0, share=0.5),
+        scheduled("cooler_down", 11.0, 1.0, share=0.25),
+        scheduled("cdu_down", 12.0, 1.0, unit=1),
+        scheduled("cdu_pump_down", 13.0, 1.0),
+        scheduled("leak", 14.0, 2.0, rack=0, litres=30.0),
     )
     line = timeline(
         data_center("a"),
@@ -93,16 +110,10 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         steps_per_hour=1,
     )
     assert not line.event_free
-    normal = [
-        [True] * 5,
-        [1.0, 1.0],
-        [1.0] * 6,
-        [0.0, 0.0],
-        [True, True],
-        *[[1.0, 1.0]] * 3,
-        [True, True],
-    ]
-    expected = {
+    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True], *[[1.0, 1.0]] * 3]
+    normal += [[True, True], [1.0, 1.0], [1.0, 1.0], [True] * 4, [True] * 4]
+    normal += [[False, False], [0.0, 0.0]]
+    expected: dict[int, tuple[Any, ...]] = {
         1: (0, [True, True, True, True, False]),
         2: (1, [1.0, 0.4]),
         3: (2, [1.0, 1.0, 1.0, 1.0, 0.25, 1.0]),
@@ -112,12 +123,19 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         7: (5, [1.0, 0.5]),
         8: (7, [1.0, 0.75]),
         9: (6, [1.0, 0.25]),
-        10: (8, [True, False]),
+        10: (9, [1.0, 0.5]),
+        11: (10, [1.0, 0.25]),
+        12: (11, [True, True, True, False]),
+        13: (12, [True, True, False, False]),
+        14: (13, [False, True], 14, [0.0, 30.0]),
+        # A leak empties at once, and its rack stays off.
+        15: (13, [False, True]),
+        16: (8, [True, False]),
     }
-    for step in range(12):
+    for step in range(18):
         wanted = list(normal)
-        if step in expected:
-            place, values = expected[step]
+        changes = expected.get(step, ())
+        for place, values in zip(changes[::2], changes[1::2], strict=True):
             wanted[place] = values
         assert line.at(step).active == (step in expected)
         assert line.at(step).active_events.tolist() == [0.0, float(step in expected)]

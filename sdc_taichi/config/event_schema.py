@@ -20,6 +20,11 @@ EventKind = Literal[
     "heat_wave",
     "grid_outage",
     "link_down",
+    "cdu_down",
+    "cdu_pump_down",
+    "facility_pump_down",
+    "cooler_down",
+    "leak",
 ]
 
 WaveK = Annotated[float, Field(ge=-40, le=40)]
@@ -32,6 +37,9 @@ DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
 OutletC = Annotated[float, Field(ge=20, le=120)]
 """Outlet air temperature of servers, 20..120 C: from usual inlets to temperatures that damage any
 circuit board."""
+
+Litres = Annotated[float, Field(ge=0, le=1e6)]
+"""Coolant lost by a leak, 0..1e6 l: from a drop to a large storage tank."""
 
 LEAST_DRAUGHT_SHARE = 0.01
 """Smallest airflow of a rack with failed fans, as a share of its normal airflow. It is not 0,
@@ -49,8 +57,24 @@ _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "heat_wave": ("offset_k",),
     "grid_outage": (),
     "link_down": (),
+    "cdu_down": (),
+    "cdu_pump_down": (),
+    "facility_pump_down": ("share",),
+    "cooler_down": ("share",),
+    "leak": ("rack", "litres"),
 }
-_OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",), "link_down": ("site",)}
+_OPTIONAL: dict[EventKind, tuple[str, ...]] = {
+    **dict.fromkeys(("crac_down", "cdu_down", "cdu_pump_down"), ("unit",)),
+    "link_down": ("site",),
+}
+LIQUID_EVENTS: tuple[EventKind, ...] = (
+    "cdu_down",
+    "cdu_pump_down",
+    "facility_pump_down",
+    "cooler_down",
+    "leak",
+)
+"""Kinds of events that need liquid-cooled racks."""
 PLANT_OF_EVENT: dict[EventKind, Plant] = {
     "tower_cell_down": "water_cooled",
     "dry_cooler_down": "air_cooled",
@@ -112,16 +136,19 @@ class ScheduledEvent(Section):
     duration_h: DurationH
     """Duration of the event, in h."""
     unit: Annotated[int, Field(ge=0, le=9_999)] | None = None
-    """Number of the CRAC unit that fails, counted from 0; None means all units."""
+    """Number of the CRAC unit or CDU that fails, counted from 0; None means all of them."""
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
-    """Number of the rack whose fans fail, counted from 0, row by row."""
+    """Number of the rack whose fans fail or that leaks, counted from 0, row by row."""
     site: Name | None = None
     """Site of the fleet whose links fail; None means all sites."""
     share: Share | None = None
-    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air or
-    rack airflow that remain, as a share of all, 0..1."""
+    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air,
+    rack airflow, pumps of facility water or fans of its cooler that remain, as a share of all,
+    0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
+    litres: Litres | None = None
+    """Coolant that a leak loses in its first step, in l; the rack stays off until it ends."""
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> Self:
@@ -132,7 +159,7 @@ class ScheduledEvent(Section):
 class SampledEvent(Section):
     """Failures or weather events at random times: a Poisson process with uniform durations.
 
-    All CRAC units, or all racks, are equally likely to fail. Each site of a fleet has events of its
+    All CRAC units, CDUs or racks are equally likely to fail. Each site of a fleet has events of its
     own.
     """
 
@@ -143,10 +170,13 @@ class SampledEvent(Section):
     duration_h: tuple[DurationH, DurationH]
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
-    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air or
-    rack airflow that remain, as a share of all, 0..1."""
+    """Chiller capacity, pumps, buffer tanks, tower cells, dry coolers, openings for outdoor air,
+    rack airflow, pumps of facility water or fans of its cooler that remain, as a share of all,
+    0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
+    litres: Litres | None = None
+    """Coolant that a leak loses in its first step, in l; the rack stays off until it ends."""
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> Self:
@@ -168,7 +198,7 @@ class EventsConfig(Section):
 
 def _check_fields_of_kind(event: ScheduledEvent | SampledEvent) -> None:
     required, optional = _REQUIRED[event.kind], _OPTIONAL.get(event.kind, ())
-    for name in ("unit", "rack", "site", "share", "offset_k"):
+    for name in ("unit", "rack", "site", "share", "offset_k", "litres"):
         if name not in type(event).model_fields:
             continue
         has_value = getattr(event, name) is not None

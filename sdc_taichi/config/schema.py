@@ -13,7 +13,12 @@ import yaml
 from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.electrical_schema import ElectricalConfig, TariffConfig
-from sdc_taichi.config.event_schema import PLANT_OF_EVENT, EventsConfig, ProtectionConfig
+from sdc_taichi.config.event_schema import (
+    LIQUID_EVENTS,
+    PLANT_OF_EVENT,
+    EventsConfig,
+    ProtectionConfig,
+)
 from sdc_taichi.config.fields import (
     CRate,
     FileName,
@@ -343,13 +348,23 @@ class DataCenterConfig(Section):
                         f"events.{name}.{index}.kind link_down needs a fleet; valid with "
                         "fleet.sites"
                     )
+                if event.kind in LIQUID_EVENTS and self.liquid is None:
+                    raise ValueError(
+                        f"events.{name}.{index}.kind {event.kind} needs section liquid"
+                    )
         return self
 
     @model_validator(mode="after")
     def _names_existing_places(self) -> Self:
         crac, racks = self.hvac.crac, self.hall.racks
+        cdus = (
+            0
+            if self.liquid is None
+            else self.liquid.cdus.manifolds * (self.liquid.cdus.per_manifold)
+        )
         for index, event in enumerate(self.events.scheduled):
-            for name, limit in (("unit", crac.units), ("rack", racks)):
+            units = cdus if event.kind in LIQUID_EVENTS else crac.units
+            for name, limit in (("unit", units), ("rack", racks)):
                 number = getattr(event, name)
                 if number is not None and number >= limit:
                     raise ValueError(
@@ -360,6 +375,10 @@ class DataCenterConfig(Section):
                 raise ValueError(
                     f"events.scheduled.{index}.site {event.site!r}: valid is one of "
                     f"{', '.join(sites)}"
+                )
+            if event.kind == "leak" and event.rack not in self.liquid_racks():
+                raise ValueError(
+                    f"events.scheduled.{index}.rack {event.rack}: is no liquid-cooled rack"
                 )
         check_one_per_rack("hvac.crac.unit_shares", crac.unit_shares, racks)
         for rack, shares in enumerate(crac.unit_shares or ()):
@@ -395,6 +414,7 @@ class DataCenterConfig(Section):
             "hall.inlet_model recirculation": self.hall.inlet_model == "recirculation",
             "hall.capacity_mw null": self.hall.capacity_mw is None,
             "hvac.sizing.model design_day": self.hvac.sizing.model == "design_day",
+            "workload.model fluid": self.workload.model == "fluid",
         }
         for condition, is_met in needs.items():
             if not is_met:

@@ -142,6 +142,23 @@ def humidity_ratio(outdoor_c: Values, wet_bulb_c: Values, at_wet_bulb: Values) -
     return np.maximum(taken_up / (2501.0 + 1.86 * outdoor_c - of_water), 0.0)
 
 
+def dew_point_c(outdoor_c: Values, wet_bulb_c: Values, pressure_pa: Values) -> Values:
+    """Return the dew point from dry bulb and wet bulb, in C, at least -60 C.
+
+    The Magnus equation with the coefficients of Alduchov and Eskridge (Journal of Applied
+    Meteorology 35, 1996) is inverted; it is within 0.4 % of measured pressures at -40..50 C.
+
+    Args:
+        outdoor_c: Dry-bulb temperature, C.
+        wet_bulb_c: Wet-bulb temperature, C.
+        pressure_pa: Air pressure, Pa.
+    """
+    ratio = humidity_ratio(outdoor_c, wet_bulb_c, saturated_ratio(wet_bulb_c, pressure_pa))
+    vapour_pa = pressure_pa * ratio / (WATER_TO_DRY_AIR + ratio)
+    x = np.log(np.maximum(vapour_pa, 1.0) / 610.94)
+    return np.minimum(243.04 * x / (17.625 - x), outdoor_c)
+
+
 def dry_air_kg_m3(outdoor_c: Values, ratio: Values, pressure_pa: Values) -> Values:
     """Return the mass of dry air per volume of moist air, in kg/m3 (eq. 26).
 

@@ -102,8 +102,7 @@ class CommandedHalls:
         self._commands = self._stages.decoder.decode(None)
         self._normal = schedule(
             fleet.configs,
-            rack_offsets=fleet.rack_offsets,
-            unit_offsets=fleet.unit_offsets,
+            fleet.places,
             steps_per_hour=fleet.steps_per_hour,
             seed=0,
         ).at(0)

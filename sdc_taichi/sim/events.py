@@ -30,11 +30,13 @@ _PLANT_SHARES: dict[str, tuple[EventKind, ...]] = {
     "pump_share": ("pump_down",),
     "tank_share": ("tank_down",),
     "outdoor_units": ("tower_cell_down", "dry_cooler_down", "outdoor_air_closed"),
+    "facility_pump": ("facility_pump_down",),
+    "cooler_share": ("cooler_down",),
 }
 """Event kinds that reduce each share of plant devices, by the field of ``Disturbance``."""
 _KINDS_WITH_SHARE = {"rack_fan_failure"}.union(*_PLANT_SHARES.values())
 _NO_TARGET = -1
-"""Target index of events that affect all CRAC units, or that have no target."""
+"""Target index of events that affect all CRAC units or CDUs, or that have no target."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -65,6 +67,47 @@ class Disturbance:
     """Share of the tower cells, dry coolers or outdoor air openings that work, 0..1, (B,)."""
     link_up: Mask
     """True for each data center whose links to the sites of its fleet work, (B,)."""
+    facility_pump: F64
+    """Share of the pumps of the facility water that work, 0..1, (B,)."""
+    cooler_share: F64
+    """Share of the fans that cool the facility water that work, 0..1, (B,)."""
+    cdu_up: Mask
+    """True for each CDU that has not failed, (C,)."""
+    cdu_pump_up: Mask
+    """True for each CDU of which no pump has failed, (C,)."""
+    rack_leaks: Mask
+    """True for each liquid-cooled rack that leaks, (L,)."""
+    leaked_l: F64
+    """Coolant lost by leaks in the step, in l, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Places of a fleet that events affect, as first indices of each data center and totals."""
+
+    rack_offsets: npt.NDArray[np.integer]
+    """First rack of each data center, and the number of racks, (B + 1,)."""
+    unit_offsets: npt.NDArray[np.integer]
+    """First CRAC unit of each data center, and the number of units, (B + 1,)."""
+    cdu_offsets: npt.NDArray[np.integer]
+    """First CDU of each data center, and the number of CDUs, (B + 1,)."""
+    liquid_racks: npt.NDArray[np.integer]
+    """Index of each liquid-cooled rack among all racks, (L,)."""
+
+    def targets(self, kind: EventKind, dc: int) -> I64:
+        """Return the indices within a data center among which a sampled event draws its target.
+
+        The result is empty for kinds without a target.
+        """
+        if kind in ("crac_down", "cdu_down", "cdu_pump_down"):
+            offsets = self.unit_offsets if kind == "crac_down" else self.cdu_offsets
+            return np.arange(int(offsets[dc + 1] - offsets[dc]))
+        first, end = int(self.rack_offsets[dc]), int(self.rack_offsets[dc + 1])
+        if kind == "rack_fan_failure":
+            return np.arange(end - first)
+        racks = np.asarray(self.liquid_racks, dtype=np.int64)
+        inside = (racks >= first) & (racks < end) & (kind == "leak")
+        return np.asarray(racks[inside] - first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +119,8 @@ class ActiveEvent:
     dc: int
     """Index of the affected data center, counted from 0."""
     target: int | None
-    """Index of the affected CRAC unit or rack within its data center; None if the event affects
-    all units or has no target."""
+    """Index of the affected CRAC unit, CDU or rack within its data center; None if the event
+    affects all units or has no target."""
     share: float | None
     """Remaining share of capacity or airflow, 0..1; None for kinds without a share."""
     offset_k: float | None
@@ -100,10 +143,11 @@ class _Events:
     dc: I64
     """Index of the data center, counted from 0, (E,)."""
     target: I64
-    """Index of the CRAC unit or rack within the data center, (E,); -1 for all units or no
+    """Index of the CRAC unit, CDU or rack within the data center, (E,); -1 for all units or no
     target."""
     value: F64
-    """Remaining share, 0..1, or temperature offset, in K, (E,); nan for kinds without either."""
+    """Remaining share, 0..1, temperature offset, in K, or loss by a leak, in l, (E,); nan for kinds
+    without any."""
     first_step: I64
     """First step since reset that the event covers, (E,)."""
     end_step: I64
@@ -122,8 +166,8 @@ class _Rule:
     """Index of the data center, counted from 0."""
     key: tuple[int, int]
     """Key of the random stream: CRC-32 of the data center's name, and the index of the rule."""
-    targets: int
-    """Number of CRAC units or racks to draw a target from; 0 for kinds without a target."""
+    targets: I64
+    """Indices of CRAC units, CDUs or racks to draw a target from; empty for kinds without one."""
     event: SampledEvent
     """Rate, duration and effect, as in the config."""
 
@@ -140,15 +184,14 @@ class Timeline:
         scheduled: _Events,
         rules: tuple[_Rule, ...],
         *,
-        rack_offsets: I64,
-        unit_offsets: I64,
+        places: Places,
         steps_per_hour: int,
         seed: I64 | int,
     ) -> None:
         self._scheduled, self._rules = scheduled, rules
-        size = len(rack_offsets) - 1
+        size = len(places.rack_offsets) - 1
         self._seed = np.broadcast_to(np.asarray(seed, dtype=np.int64), (size,))
-        self._rack_offsets, self._unit_offsets = rack_offsets, unit_offsets
+        self._places = places
         self._steps_per_hour = steps_per_hour
         longest_h = max((rule.event.duration_h[1] for rule in rules), default=0.0)
         self._blocks_back = int(np.ceil(longest_h / HOURS_PER_BLOCK))
@@ -159,15 +202,21 @@ class Timeline:
             Disturbance(
                 active=False,
                 active_events=np.zeros(size),
-                unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
+                unit_up=np.ones(places.unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
                 pump_share=np.ones(size),
                 tank_share=np.ones(size),
                 outdoor_units=np.ones(size),
-                rack_airflow=np.ones(rack_offsets[-1]),
+                rack_airflow=np.ones(places.rack_offsets[-1]),
                 outdoor_offset_k=np.zeros(size),
                 grid_up=np.ones(size, dtype=np.bool_),
                 link_up=np.ones(size, dtype=np.bool_),
+                facility_pump=np.ones(size),
+                cooler_share=np.ones(size),
+                cdu_up=np.ones(places.cdu_offsets[-1], dtype=np.bool_),
+                cdu_pump_up=np.ones(places.cdu_offsets[-1], dtype=np.bool_),
+                rack_leaks=np.zeros(len(places.liquid_racks), dtype=np.bool_),
+                leaked_l=np.zeros(size),
             )
         )
 
@@ -183,8 +232,7 @@ class Timeline:
         return Timeline(
             self._scheduled,
             self._rules,
-            rack_offsets=self._rack_offsets,
-            unit_offsets=self._unit_offsets,
+            places=self._places,
             steps_per_hour=self._steps_per_hour,
             seed=seed,
         )
@@ -198,24 +246,21 @@ class Timeline:
         if not len(events.kind):
             return self._normal
         normal = self._normal
-        unit_up, grid_up = normal.unit_up.copy(), normal.grid_up.copy()
+        grid_up, places = normal.grid_up.copy(), self._places
         link_up = normal.link_up.copy()
         airflow = normal.rack_airflow.copy()
         offset_k = normal.outdoor_offset_k.copy()
         is_kind = {kind: events.kind == code for code, kind in enumerate(_KINDS)}
-        down = events.where(is_kind["crac_down"])
-        one = down.target != _NO_TARGET
-        unit_up[self._unit_offsets[down.dc[one]] + down.target[one]] = False
-        without = np.zeros(len(grid_up), dtype=np.bool_)
-        without[down.dc[~one]] = True
-        unit_up &= ~np.repeat(without, np.diff(self._unit_offsets))
+        leaks = events.where(is_kind["leak"])
+        leaking = places.rack_offsets[leaks.dc] + leaks.target
+        begin = leaks.where(leaks.first_step == step)
         shares = {}
         for name, kinds in _PLANT_SHARES.items():
             shares[name] = getattr(normal, name).copy()
             left = events.where(np.logical_or.reduce([is_kind[kind] for kind in kinds]))
             np.multiply.at(shares[name], left.dc, left.value)
         failed = events.where(is_kind["rack_fan_failure"])
-        np.multiply.at(airflow, self._rack_offsets[failed.dc] + failed.target, failed.value)
+        np.multiply.at(airflow, places.rack_offsets[failed.dc] + failed.target, failed.value)
         wave = events.where(is_kind["heat_wave"])
         np.add.at(offset_k, wave.dc, wave.value)
         grid_up[events.dc[is_kind["grid_outage"]]] = False
@@ -224,7 +269,11 @@ class Timeline:
             Disturbance(
                 active=True,
                 active_events=np.bincount(events.dc, minlength=len(grid_up)).astype(np.float64),
-                unit_up=unit_up,
+                unit_up=_still_up(places.unit_offsets, events.where(is_kind["crac_down"])),
+                cdu_up=_still_up(places.cdu_offsets, events.where(is_kind["cdu_down"])),
+                cdu_pump_up=_still_up(places.cdu_offsets, events.where(is_kind["cdu_pump_down"])),
+                rack_leaks=np.isin(places.liquid_racks, leaking),
+                leaked_l=np.bincount(begin.dc, begin.value, len(grid_up)).astype(np.float64),
                 **shares,
                 rack_airflow=airflow,
                 outdoor_offset_k=offset_k,
@@ -289,19 +338,16 @@ class Timeline:
         n = int(rng.poisson(event.per_year))
         start_h = HOURS_PER_BLOCK * (block + rng.random(n))
         duration_h = rng.uniform(*event.duration_h, n)
-        target = rng.integers(rule.targets, size=n) if rule.targets else np.full(n, _NO_TARGET)
+        target = np.full(n, _NO_TARGET)
+        if len(rule.targets):
+            target = rule.targets[rng.integers(len(rule.targets), size=n)]
         return _events(
             event, rule.dc, target, start_h, duration_h, steps_per_hour=self._steps_per_hour
         )
 
 
 def schedule(
-    configs: Sequence[DataCenterConfig],
-    *,
-    rack_offsets: npt.NDArray[np.integer],
-    unit_offsets: npt.NDArray[np.integer],
-    steps_per_hour: int,
-    seed: I64 | int,
+    configs: Sequence[DataCenterConfig], places: Places, *, steps_per_hour: int, seed: I64 | int
 ) -> Timeline:
     """Create the timeline of scheduled and sampled events of a fleet.
 
@@ -312,19 +358,17 @@ def schedule(
 
     Args:
         configs: Configs of B data centers.
-        rack_offsets: First rack of each data center, and the total, (B + 1,).
-        unit_offsets: First CRAC unit of each data center, and the total, (B + 1,).
+        places: CRAC units, CDUs and racks of these data centers.
         steps_per_hour: Number of steps in an hour.
         seed: Seed of the sampled events, at least 0, (B,) or one for all.
     """
-    racks, units = np.diff(rack_offsets), np.diff(unit_offsets)
     listed, rules = [_EMPTY], []
     for dc, config in enumerate(configs):
         for event in config.events.scheduled:
             # All sites of a fleet have the events of its configuration.
             if event.site is not None and event.site.upper() != config.site.location.upper():
                 continue
-            target = event.rack if event.kind == "rack_fan_failure" else event.unit
+            target = event.unit if event.rack is None else event.rack
             listed.append(
                 _events(
                     event,
@@ -336,14 +380,12 @@ def schedule(
                 )
             )
         key = zlib.crc32(config.name.encode())
-        targets = {"crac_down": int(units[dc]), "rack_fan_failure": int(racks[dc])}
         for i, rule in enumerate(config.events.sampled):
-            rules.append(_Rule(dc, (key, i), targets.get(rule.kind, 0), rule))
+            rules.append(_Rule(dc, (key, i), places.targets(rule.kind, dc), rule))
     return Timeline(
         _concatenated(listed),
         tuple(rules),
-        rack_offsets=np.asarray(rack_offsets, dtype=np.int64),
-        unit_offsets=np.asarray(unit_offsets, dtype=np.int64),
+        places=places,
         steps_per_hour=steps_per_hour,
         seed=seed,
     )
@@ -405,7 +447,7 @@ def _events(
     # The tolerance absorbs round-off in times that are meant to be step boundaries.
     start = np.floor(start_h * steps_per_hour + 1e-9)
     end = np.ceil((start_h + duration_h) * steps_per_hour - 1e-9)
-    value = event.share if event.share is not None else event.offset_k
+    value = next((x for x in (event.share, event.offset_k, event.litres) if x is not None), None)
     n = len(start)
     return _Events(
         kind=np.full(n, _KINDS.index(event.kind)),
@@ -415,6 +457,21 @@ def _events(
         first_step=start.astype(np.int64),
         end_step=np.maximum(end, start + 1.0).astype(np.int64),
     )
+
+
+def _still_up(offsets: npt.NDArray[np.integer], down: _Events) -> Mask:
+    """Return True for each unit that none of the events has down.
+
+    Args:
+        offsets: First unit of each data center, and the number of units, (B + 1,).
+        down: Events that have one unit, or all units of a data center, down.
+    """
+    up = np.ones(offsets[-1], dtype=np.bool_)
+    one = down.target != _NO_TARGET
+    up[offsets[down.dc[one]] + down.target[one]] = False
+    without = np.zeros(len(offsets) - 1, dtype=np.bool_)
+    without[down.dc[~one]] = True
+    return np.asarray(up & ~np.repeat(without, np.diff(offsets)))
 
 
 def _concatenated(listed: Sequence[_Events]) -> _Events:

@@ -7,7 +7,7 @@ quantities have the names that they have in ``StepResult``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -75,6 +75,16 @@ class StepInputs:
     """Operation of the CRAC units."""
     air: HallSums
     """Airflows, temperatures and power of the halls."""
+    liquid: LiquidLoads | None = None
+    """Liquid cooling; None for fleets without it."""
+
+
+class LiquidLoads(Protocol):
+    """Liquid cooling of B data centers in one step, see ``LiquidStep``."""
+
+    more_it_w: F64
+    overhead_w: F64
+    more_water_l: F64
 
 
 def battery_parameters(fleet: Fleet) -> BatteryParameters:
@@ -211,8 +221,10 @@ class Facility:
         Returns:
             Quantities of ``StepResult`` by their field names, each (B,).
         """
-        it_w = inputs.air.cpu_w + inputs.air.it_fan_w
-        air = self._crac_air(inputs, it_w)
+        air_w = it_w = inputs.air.cpu_w + inputs.air.it_fan_w
+        if inputs.liquid is not None:
+            it_w = air_w + inputs.liquid.more_it_w
+        air = self._crac_air(inputs, air_w)
         requested_w = self._requested_w(inputs, air)
         at = inputs.surroundings, inputs.supply, air.return_c, air.crac_flow_m3s
         plant = self._operate(requested_w, *at)
@@ -227,7 +239,11 @@ class Facility:
             plant = self._with_coil_pumps(plant, carried_w, least_w, inputs.surroundings)
         heat = self._balance_heat(inputs, air, plant)
         water = self._use_water(inputs, air, plant)
-        energy = self._energy(inputs, it_w, self._hvac_w(air, plant))
+        hvac_w = self._hvac_w(air, plant)
+        if inputs.liquid is not None:
+            hvac_w = hvac_w + inputs.liquid.overhead_w
+            water.water_l = water.water_l + inputs.liquid.more_water_l
+        energy = self._energy(inputs, it_w, hvac_w)
         indices = self._air_indices(inputs.air, air.return_c)
         results = joined(*map(fields_of, (air, plant, heat, water, indices)), energy)
         # Internal quantities of the plant, such as its water and airflows, are not reported.
@@ -255,7 +271,12 @@ class Facility:
         return np.where(grid_up, all_step, lasts)
 
     def _crac_air(self, inputs: StepInputs, it_w: F64) -> CracQuantities:
-        """Compute airflow, fan power, return temperature and cooling load of the CRAC units."""
+        """Compute airflow, fan power, return temperature and cooling load of the CRAC units.
+
+        Args:
+            inputs: Results of the preceding stages.
+            it_w: Heat of the servers in the hall's air, in W, (B,).
+        """
         if self._recirculates:
             fan_w = self._while_powered(
                 self._fan_w_per_m3s * inputs.air.cubed_flow_m3s, inputs.surroundings
@@ -562,6 +583,7 @@ class FacilityStage:
         surroundings: Surroundings,
         supply: Supply,
         air: HallSums,
+        liquid: LiquidLoads | None = None,
     ) -> dict[str, F64]:
         """Run ``Facility.step``; the arguments are the fields of ``StepInputs``.
 
@@ -569,8 +591,14 @@ class FacilityStage:
             Quantities by their field names in ``StepResult``, and ``within_limits``, (B,): 1 for
             data centers whose results are physical, else 0.
         """
+        stages: dict[str, Any] = {} if liquid is None else {"liquid": liquid}
         results = self._step(
-            state=state, commands=commands, surroundings=surroundings, supply=supply, air=air
+            state=state,
+            commands=commands,
+            surroundings=surroundings,
+            supply=supply,
+            air=air,
+            **stages,
         )
         results["unit_flow_m3s"] = (
             air.unit_airflow_m3s if self._recirculates else results["crac_flow_m3s"]

@@ -26,7 +26,10 @@ from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import in_row_order
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
+from sdc_taichi.plant.liquid import LiquidFleet
+from sdc_taichi.sim.events import Places
 from sdc_taichi.sim.fleet_configs import with_sites
+from sdc_taichi.sim.liquid_fleet import liquid_fleet
 from sdc_taichi.sim.shared_work import SharedWork, shared_work
 from sdc_taichi.types import F64, I32
 
@@ -158,6 +161,8 @@ class Fleet:
     cdu_offsets: I32
     """First coolant distribution unit (CDU) of each data center, and the number of CDUs,
     (B + 1,)."""
+    liquid: LiquidFleet | None
+    """Liquid-cooled racks with their manifolds, CDUs and facility loops; None without any."""
     air: HallAir | None
     """Recirculation and CRAC supply; None with inlet model ``approach``."""
     shared_work: SharedWork | None
@@ -177,6 +182,11 @@ class Fleet:
     def unit_dc(self) -> I32:
         """Index of each CRAC unit's data center, (U,)."""
         return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_offsets))
+
+    @property
+    def places(self) -> Places:
+        """Racks, CRAC units and CDUs, which events affect."""
+        return Places(self.rack_offsets, self.unit_offsets, self.cdu_offsets, self.liquid_racks)
 
     @property
     def cdus(self) -> int:
@@ -383,6 +393,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         cdu_offsets=offsets_from_counts(
             [0 if c is None else c.manifolds * c.per_manifold for c in cdus], "CDUs"
         ),
+        liquid=liquid_fleet(listed),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
         shared_work=shared_work(listed),
     )

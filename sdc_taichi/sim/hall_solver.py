@@ -325,6 +325,8 @@ class Hall:
         )
         """True if the racks' results are returned without a copy. With an outlet model other than
         ``server``, the layers kernel reads these results again, so callers must get a copy."""
+        self._group_rows = len(tables.arrays["group_inputs"])
+        """Number of group inputs whose lanes are racks."""
         self._has_rows_along_racks = False
         self.hottest_outlet_c = 0.0
         """Highest server outlet temperature of all halls in the last step, in C."""
@@ -348,6 +350,40 @@ class Hall:
         """Sampled racks of the data centers ``_sparse_dcs``; None if there are none."""
         if samples and len(self._sparse_dcs):
             self._add_sampled_racks(precision)
+
+    def take_heat_of(self, racks: npt.NDArray[np.integer]) -> None:
+        """Let the heat of some racks be an input of each step, see ``set_heat``.
+
+        Args:
+            racks: Indices of these racks, whose blocks share no group inputs with others.
+        """
+        fleet, arrays = self._fleet, self._tables.arrays
+        first, counts = fleet.group_offsets[racks], np.diff(fleet.group_offsets)[racks]
+        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        place = self._places.of_racks[racks]
+        row = self._tables.rows("block_ints")["first_row"][place // LANES]
+        entry = (np.repeat(row, counts) + number) * len(GROUP_INPUTS)
+        lane = np.repeat(place % LANES, counts)
+        groups = np.repeat(first, counts) + number
+        rows = np.concatenate(fleet.group_rows, axis=1)[:, groups]
+        count, full_w = (rows[row_index(GROUP_INPUTS, name)] for name in ("count", "full_w"))
+        in_rack = np.repeat(np.arange(len(racks)), counts)
+        of_rack_w = np.bincount(in_rack, count * full_w)
+        self._heat_rack, self._heat_share = in_rack, full_w / of_rack_w[in_rack]
+        self._heat_at = (entry + row_index(GROUP_INPUTS, "idle_w")) * LANES + lane
+        at_full_w = (entry + row_index(GROUP_INPUTS, "full_w")) * LANES + lane
+        arrays["group_inputs"].reshape(-1)[at_full_w] = 0.0
+
+    def set_heat(self, rack_w: F64) -> None:
+        """Set the heat of the racks of ``take_heat_of`` while they are on, without fans.
+
+        Args:
+            rack_w: Heat of each of these racks, in W.
+        """
+        inputs = self._tables.arrays["group_inputs"].reshape(-1)
+        inputs[self._heat_at] = self._heat_share * rack_w[self._heat_rack]
+        # Layers read copies of the group inputs.
+        self._has_rows_along_racks = False
 
     @property
     def sweeps(self) -> I32:
@@ -962,7 +998,7 @@ class Hall:
         self._step_kernel.release("group_inputs")
         self._layers_kernel.release("group_inputs")
         arrays["group_inputs"], first = build_rows_along_racks(
-            arrays["group_inputs"], arrays["block_ints"]
+            arrays["group_inputs"][: self._group_rows], arrays["block_ints"]
         )
         self._tables.rows("block_ints")["first_row_along"][:] = first
         self._step_kernel.bind(group_inputs=arrays["group_inputs"])

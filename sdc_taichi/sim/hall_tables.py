@@ -301,9 +301,12 @@ def _build_group_inputs(
     row_of_block: dict[Any, int] = {}
     blocks_of_hall: dict[int, slice] = {}
     entries, first_row, total = [], np.zeros(len(groups), np.int64), 0
+    is_liquid = np.zeros(len(groups), np.bool_)
+    is_liquid[places.of_racks[fleet.liquid_racks] // LANES] = True
     for dc, (begin, end) in enumerate(pairwise(places.block_offsets)):
         rows, blocks = fleet.group_rows[dc], slice(begin, end)
-        same = blocks_of_hall.setdefault(id(rows), blocks)
+        # The heat of liquid-cooled racks is an input, so their blocks do not share entries.
+        same = blocks if is_liquid[blocks].any() else blocks_of_hall.setdefault(id(rows), blocks)
         if same != blocks:
             first_row[blocks] = first_row[same]
             continue
@@ -314,7 +317,7 @@ def _build_group_inputs(
             end_rack = first_rack[i] + racks[i]
             offsets = fleet.group_offsets[first_rack[i] : end_rack + 1] - group_0
             values = rows[:, offsets[0] : offsets[-1]]
-            key = (values.tobytes(), (offsets - offsets[0]).tobytes())
+            key = (values.tobytes(), (offsets - offsets[0]).tobytes(), i if is_liquid[i] else -1)
             if key not in row_of_block:
                 row_of_block[key] = total
                 entries.append(_block_entry(rows, offsets, groups[i], dtype))

@@ -1,29 +1,326 @@
-"""Liquid-cooled racks in the steps of a fleet: their state, and results where there are none."""
+"""Liquid-cooled racks in the steps of a fleet: inputs, results and effects on other stages."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from sdc_taichi.hall.protection import TRIPPED
+from sdc_taichi.plant import moist_air
+from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import CDUS, DATA_CENTERS, QUANTITIES, RACKS, LiquidQuantities
-
-STATE_FIELDS = (
-    "cdu_setpoint_c",
-    "cdu_flow",
-    "junction_c",
-    "manifold_return_c",
-    "manifold_supply_c",
-    "facility_return_c",
-    "facility_supply_c",
+from sdc_taichi.sim.hall_solver import Hall, HallSums
+from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult, LiquidState
+from sdc_taichi.sim.sizing import sites_pressure_pa
+from sdc_taichi.sim.step_inputs import Commands, Surroundings
+from sdc_taichi.sim.work_allocation import Placement
+from sdc_taichi.types import (
+    CDUS,
+    DATA_CENTERS,
+    F64,
+    QUANTITIES,
+    RACKS,
+    LiquidQuantities,
+    Reals,
+    State,
+    fields_of,
 )
+
+STATE_FIELDS = tuple(f.name for f in fields(LiquidState))
 """Fields of ``State`` that liquid cooling needs."""
+_STEADY_FIELDS = ("cdu_setpoint_c", "cdu_flow")
+"""Fields of ``State`` that liquid cooling of quasi-steady halls needs."""
 _NAMES = {
     axis: tuple(f.name for f in fields(LiquidQuantities) if QUANTITIES[f.name].axis == axis)
     for axis in (DATA_CENTERS, CDUS, RACKS)
 }
+_OF_RESULT = {f.name for f in fields(LiquidResult)}
+_DEVICES = ("cdu_pump", "facility_pump", "cooler_fan", "trim_chiller", "heat_pump")
+"""Devices of liquid cooling with electric power."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass
+class LiquidStep:
+    """Liquid cooling of B data centers and L liquid-cooled racks in one step."""
+
+    more_it_w: F64
+    """IT power less the heat that the hall's air takes from liquid-cooled racks, in W, (B,)."""
+    overhead_w: F64
+    """Electric power of pumps, fans, trim chiller and heat pump, in W, (B,)."""
+    more_water_l: F64
+    """Water and coolant that the loops consume, in l, (B,)."""
+    quantities: dict[str, Any]
+    """``LiquidQuantities`` by name."""
+    rack_it_w: F64
+    """Power of each liquid-cooled rack, in W, (L,)."""
+    server_w: F64
+    """Power of a server of each liquid-cooled rack while it is on, less its heat in the hall's air,
+    in W, (L,)."""
+    tripped: Mask
+    """True for racks that switch off, (R,)."""
+    has_coolant: Mask
+    """True for racks in air, and for those whose coolant can flow, (R,)."""
+    throttled_tasks: F64
+    """Started work that limited GPUs did not complete, in tasks, (B,)."""
+    state: dict[str, F64]
+    """Fields of ``State`` at the end of the step."""
+    without_room_tasks: F64
+    """Part of ``throttled_tasks`` for which the queue has no room, in tasks, (B,)."""
+
+
+class LiquidHalls:
+    """Runs the liquid cooling of a fleet between the placement of work and the air of the halls.
+
+    Args:
+        fleet: B data centers with L liquid-cooled racks.
+        hall: Halls of these data centers, whose sizes are known: the heat that liquid-cooled racks
+            give to their air is an input from now on.
+    """
+
+    def __init__(self, fleet: Fleet, hall: Hall) -> None:
+        assert fleet.liquid is not None
+        self._fleet, self._hall, self._transient = (
+            fleet,
+            hall,
+            fleet.models["thermal"] == "transient",
+        )
+        self._racks = fleet.liquid_racks
+        self._dc = fleet.rack_dc[self._racks]
+        self._model = Liquid(
+            fleet.liquid, step_s=3600.0 / fleet.steps_per_hour, transient=self._transient
+        )
+        self._servers = fleet.per_rack_servers()
+        self._share_of_work = self._servers[self._racks] / fleet.per_dc_servers()[self._dc]
+        self._manifold = fleet.liquid.rack_manifold
+        self._cdu_manifold = fleet.liquid.cdu_manifold
+        self._manifolds = len(fleet.liquid.rack_offsets) - 1
+        sections = [config.liquid for config in fleet.configs]
+        self._dew_point_c = np.array(
+            [0.0 if s is None else s.dew_point_c for s in sections], dtype=np.float64
+        )
+        self._is_humid = np.isnan(self._dew_point_c)
+        self._pressure_pa = sites_pressure_pa(fleet) if self._is_humid.any() else None
+        self._pump_share = np.array(
+            [s.cdus.pump_share if s.cdus.pumps > 1 else 0.0 for s in sections if s is not None]
+        ).repeat(np.diff(fleet.cdu_offsets)[[s is not None for s in sections]])
+        hall.take_heat_of(self._racks)
+
+    def initial(self, surroundings_c: tuple[F64, F64], load: F64) -> dict[str, F64]:
+        """Return the fields of ``State`` before the first step.
+
+        Args:
+            surroundings_c: Outdoor dry bulb and wet bulb, in C, (B,) each.
+            load: Utilisation of each rack, 0..1, (R,).
+        """
+        outdoor_c, wet_bulb_c = surroundings_c
+        state = self._model.initial_state(
+            LiquidInputs(
+                utilisation=load[self._racks],
+                powered=np.ones(len(self._racks)),
+                outdoor_c=outdoor_c,
+                wet_bulb_c=wet_bulb_c,
+                dew_point_c=self._room_dew_point_c(outdoor_c, wet_bulb_c),
+            )
+        )
+        return self._kept(state)
+
+    def step(
+        self, state: State, commands: Commands, surroundings: Surroundings, placement: Placement
+    ) -> LiquidStep:
+        """Compute a step, and tell the halls the heat in their air.
+
+        Args:
+            state: State at the start of the step.
+            commands: Commands of the step.
+            surroundings: Weather and failures of the step.
+            placement: Placement of the work.
+        """
+        on = np.ones(len(self._racks))
+        if placement.rack_powered is not None:
+            on = placement.rack_powered[self._racks]
+        share = None
+        if not self._transient and not surroundings.fully_powered:
+            # Steady loops run while there is power, and their results are means over the step. The
+            # loops of transient halls run during the whole step.
+            share = surroundings.powered
+            powered = (on > 0.0).astype(np.float64)
+        else:
+            powered = on
+        after, result = self._model.step(
+            state,
+            LiquidInputs(
+                utilisation=self._utilisation(placement),
+                powered=powered,
+                outdoor_c=surroundings.outdoor_c,
+                wet_bulb_c=surroundings.wet_bulb_c,
+                dew_point_c=self._room_dew_point_c(surroundings.outdoor_c, surroundings.wet_bulb_c),
+                cdu_setpoint_c=commands.cdu_setpoint_target_c,
+                cdu_flow=commands.cdu_flow_command,
+                facility_approach_k=commands.facility_approach_k,
+                reuse_share=commands.reuse_share,
+                power_cap=commands.power_cap,
+                **self._failures(surroundings),
+            ),
+        )
+        # Cold lines can take up more than racks give while they have no power.
+        result.air_w = np.maximum(result.air_w, 0.0)
+        self._hall.set_heat(result.air_w)
+        return self._as_step(after, result, on, share, surroundings)
+
+    def with_liquid(self, air: HallSums, step: LiquidStep) -> dict[str, Reals]:
+        """Return quantities of the halls in which liquid-cooled racks have their whole power."""
+        rack_cpu_w = air.rack_cpu_w.copy()
+        rack_cpu_w[self._racks] = step.rack_it_w
+        return {"cpu_w": air.cpu_w + step.more_it_w, "rack_cpu_w": rack_cpu_w}
+
+    def add_power(self, power_w: Reals, per_rack: npt.NDArray[Any], step: LiquidStep) -> None:
+        """Add the power that does not warm the hall's air to servers or server groups.
+
+        Args:
+            power_w: Power of each server or group, which is changed, in W, (S,) or (G,).
+            per_rack: Number of entries of each rack, (R,).
+            step: The step.
+        """
+        more_w = np.zeros(self._fleet.racks)
+        more_w[self._racks] = step.server_w
+        power_w += np.repeat(more_w, per_rack.astype(np.int64))
+
+    def close(self) -> None:
+        """Release the kernel arrays."""
+        self._model.close()
+
+    def _as_step(
+        self,
+        after: LiquidState,
+        result: LiquidResult,
+        on: F64,
+        share: F64 | None,
+        surroundings: Surroundings,
+    ) -> LiquidStep:
+        """Return a step from the results of the model.
+
+        Args:
+            after: State after the step.
+            result: Results of the model.
+            on: Share of the step in which each liquid-cooled rack is on, (L,).
+            share: Share of the step that the results of the model describe, (B,); None for all.
+            surroundings: Failures of the step.
+        """
+        values = {
+            name: getattr(result, name) for name in _NAMES[DATA_CENTERS] if name in _OF_RESULT
+        }
+        values |= {name: getattr(result, name) for name in _NAMES[CDUS]}
+        it_w, liquid_w, lost = result.it_w, result.liquid_w, result.lost_utilisation
+        if share is not None:
+            of_axis = {DATA_CENTERS: share, CDUS: share[self._fleet.cdu_dc]}
+            for name, value in values.items():
+                if name.endswith(("_w", "_l", "_income", "_m3s")) and name != "leak_l":
+                    values[name] = value * of_axis[QUANTITIES[name].axis]
+            of_racks = share[self._dc]
+            it_w, liquid_w, lost = it_w * of_racks, liquid_w * of_racks, lost * of_racks
+        tripped = result.tripped > 0.0
+        # The work of racks that switch off is lost as a whole.
+        lost = np.where(tripped, 0.0, lost) * self._share_of_work
+        throttled = TASKS_PER_STEP * self._sums(lost)
+        of_racks_c, of_racks_w = np.zeros((2, self._fleet.racks))
+        of_racks_c[self._racks], of_racks_w[self._racks] = result.junction_each_c, liquid_w
+        has_coolant = np.ones(self._fleet.racks, np.bool_)
+        has_coolant[self._racks] = self._coolant_flows(surroundings)
+        air_w = on * result.air_w
+        while_on_w = np.divide(it_w - air_w, on, out=np.zeros(len(on)), where=on > 0.0)
+        return LiquidStep(
+            more_it_w=self._sums(it_w - air_w),
+            overhead_w=np.sum([values[f"{device}_w"] for device in _DEVICES], axis=0),
+            more_water_l=values["cooler_water_l"] + values["leak_l"],
+            quantities=values
+            | {
+                "throttled_tasks": throttled,
+                "rack_junction_c": of_racks_c,
+                "rack_liquid_w": of_racks_w,
+            },
+            rack_it_w=it_w,
+            server_w=while_on_w / self._servers[self._racks],
+            tripped=_of_all(tripped, self._racks, self._fleet.racks),
+            has_coolant=has_coolant,
+            throttled_tasks=throttled,
+            state=self._kept(after),
+            without_room_tasks=np.zeros(self._fleet.size),
+        )
+
+    def _kept(self, state: LiquidState) -> dict[str, F64]:
+        """Return the fields of ``State``, of which quasi-steady halls need setpoints and flows."""
+        values: dict[str, F64] = fields_of(state)
+        if self._transient:
+            return values
+        return no_liquid_state() | {name: values[name] for name in _STEADY_FIELDS}
+
+    def _sums(self, of_racks: F64) -> F64:
+        """Sum values of liquid-cooled racks, (L,), within each data center, (B,)."""
+        return np.bincount(self._dc, of_racks, self._fleet.size).astype(np.float64)
+
+    def _utilisation(self, placement: Placement) -> F64:
+        """Return the utilisation of each liquid-cooled rack, 0..1, (L,)."""
+        if placement.rack_load is not None:
+            return placement.rack_load[self._racks]
+        if placement.group_load is not None:
+            busy = self._fleet.group_sums(self._fleet.per_group_servers() * placement.group_load)
+            return (busy / self._servers)[self._racks]
+        return placement.utilisation[self._dc]
+
+    def _room_dew_point_c(self, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """Return the dew point of each room, in C, (B,)."""
+        if self._pressure_pa is None:
+            return self._dew_point_c
+        outdoor_dew_c = moist_air.dew_point_c(outdoor_c, wet_bulb_c, self._pressure_pa)
+        return np.where(self._is_humid, outdoor_dew_c, self._dew_point_c)
+
+    def _failures(self, surroundings: Surroundings) -> dict[str, Any]:
+        """Return the failures as arguments of ``LiquidInputs``."""
+        given: dict[str, Any] = {"leak_l": surroundings.leaked_l}
+        if surroundings.cdu_up is None and surroundings.fully_powered:
+            return given
+        size, fleet = self._fleet.size, self._fleet
+        on = (surroundings.powered > 0.0).astype(np.float64)
+        ones = np.ones(size)
+        up = np.ones(fleet.cdus) if surroundings.cdu_up is None else surroundings.cdu_up
+        given["cdu_up"] = up * on[fleet.cdu_dc]
+        pump = ones if surroundings.facility_pump is None else surroundings.facility_pump
+        given["facility_pump"] = pump * on
+        fans = ones if surroundings.cooler_share is None else surroundings.cooler_share
+        given["cooler_share"] = fans * on
+        if surroundings.cdu_pump_up is not None:
+            given["cdu_pumps"] = np.where(surroundings.cdu_pump_up > 0.0, 1.0, self._pump_share)
+        if surroundings.rack_leaks is not None and surroundings.rack_leaks.any():
+            given["rack_valve"] = np.where(surroundings.rack_leaks, 0.0, 1.0)
+        return given
+
+    def _coolant_flows(self, surroundings: Surroundings) -> Mask:
+        """Return True for liquid-cooled racks whose coolant can flow and be cooled, (L,)."""
+        if surroundings.cdu_up is None:
+            return np.ones(len(self._racks), np.bool_)
+        assert surroundings.facility_pump is not None
+        assert surroundings.rack_leaks is not None
+        flows = self._failures(surroundings)
+        pumping = flows["cdu_up"] * flows.get("cdu_pumps", 1.0)
+        per_manifold = np.bincount(self._cdu_manifold, pumping, self._manifolds)
+        has_water = flows["facility_pump"][self._dc] > 0.0
+        return np.asarray(
+            (per_manifold[self._manifold] > 0.0) & has_water & ~surroundings.rack_leaks
+        )
+
+
+def with_leaks(state: State, surroundings: Surroundings, fleet: Fleet) -> State:
+    """Return the state of a step in which racks that leak are off."""
+    if surroundings.rack_leaks is None or not surroundings.rack_leaks.any():
+        return state
+    status = state.rack_status.copy()
+    status[fleet.liquid_racks[surroundings.rack_leaks]] = TRIPPED
+    return replace(state, rack_status=status)
 
 
 def without_liquid(fleet: Fleet) -> dict[str, Any]:
@@ -42,6 +339,13 @@ def without_liquid(fleet: Fleet) -> dict[str, Any]:
     return values
 
 
-def no_liquid_state() -> dict[str, Any]:
+def no_liquid_state() -> dict[str, F64]:
     """Return the fields of ``State`` that liquid cooling needs, empty, by name."""
     return dict.fromkeys(STATE_FIELDS, np.zeros(0))
+
+
+def _of_all(chosen: Mask, racks: npt.NDArray[np.integer], count: int) -> Mask:
+    """Return a mask of all racks from that of the racks at some indices."""
+    mask = np.zeros(count, np.bool_)
+    mask[racks] = chosen
+    return mask

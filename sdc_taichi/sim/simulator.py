@@ -23,7 +23,7 @@ from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
-from sdc_taichi.sim.liquid_halls import no_liquid_state, without_liquid
+from sdc_taichi.sim.liquid_halls import LiquidStep, no_liquid_state, with_leaks, without_liquid
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.snapshot import LAST_START
@@ -69,6 +69,8 @@ class Simulator:
         self._flags_limits = limits == "flag"
         # Air of the last step within limits; None before a step, and with limits="raise".
         self._last_air: HallSums | None = None
+        # Liquid cooling of the last step; None before a step, and without liquid-cooled racks.
+        self._liquid: LiquidStep | None = None
         # True for data centers beyond their limits in the last step, (B,); None without any.
         self._beyond: npt.NDArray[np.bool_] | None = None
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
@@ -80,8 +82,7 @@ class Simulator:
         self.step_h = 1.0 / self.fleet.steps_per_hour
         self._timeline = schedule(
             self.fleet.configs,
-            rack_offsets=self.fleet.rack_offsets,
-            unit_offsets=self.fleet.unit_offsets,
+            self.fleet.places,
             steps_per_hour=self.fleet.steps_per_hour,
             seed=0,
         )
@@ -206,6 +207,7 @@ class Simulator:
             exogenous, commands = with_loads(loads, self.fleet, exogenous, commands)
         event = self._timeline.at(state.step)
         surroundings = stages.surroundings.at(exogenous, event, state.stored_kwh)
+        state = with_leaks(state, surroundings, self.fleet)
         capacity = stages.allocation.capacity(state, commands, surroundings)
         transfer = stages.transfer.run(
             state,
@@ -220,11 +222,16 @@ class Simulator:
         )
         placement = stages.allocation.place(state, commands, surroundings, work, capacity)
         supply = stages.crac_units.supply(state, commands, surroundings)
+        liquid = None
+        if stages.liquid is not None:
+            liquid = stages.liquid.step(state, commands, surroundings, placement)
+            work, liquid.without_room_tasks = stages.workload.put_back(work, liquid.throttled_tasks)
+        self._liquid = liquid
         try:
             air, thermal = stages.air.solve(state, placement, supply, surroundings)
         except PhysicalLimitError as error:
             raise PhysicalLimitError(f"{error} (step {state.step})") from None
-        plant = stages.facility.step(state, commands, surroundings, supply, air)
+        plant = stages.facility.step(state, commands, surroundings, supply, air, liquid)
         self._beyond = None
         inside, hall = plant["within_limits"], stages.hall
         is_hot = hall.hottest_outlet_c > AIR_LIMITS_C[1]
@@ -233,14 +240,19 @@ class Simulator:
                 quantities = {**vars(surroundings), **vars(air), **plant}
                 raise limit_error(inside, quantities, state.step, self.fleet)
             air, thermal, plant = self._hold_air(
-                state, commands, surroundings, supply, air, thermal, plant
+                state, commands, surroundings, supply, air, thermal, plant, liquid
             )
         if self._flags_limits:
             self._last_air = air
-        racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
+        racks = stages.allocation.protect(state, surroundings, work, placement, air, plant, liquid)
         stage_results = map(vars, (commands, surroundings, transfer, work, supply, air, racks))
-        step = {"step": state.step, "step_h": self.step_h, **without_liquid(self.fleet)}
-        result = StepResult(*_values_of_result(joined(step, *stage_results, plant)))
+        step = {"step": state.step, "step_h": self.step_h}
+        of_liquid = without_liquid(self.fleet) if liquid is None else liquid.quantities
+        values = joined(step, *stage_results, plant, of_liquid)
+        if liquid is not None and stages.liquid is not None:
+            values |= stages.liquid.with_liquid(air, liquid)
+        result = StepResult(*_values_of_result(values))
+        thermal = thermal | (no_liquid_state() if liquid is None else liquid.state)
         self._state = _next_state(state, transfer, work, supply, plant, racks, thermal)
         return result
 
@@ -253,6 +265,7 @@ class Simulator:
         air: HallSums,
         thermal: dict[str, Any],
         plant: dict[str, Any],
+        liquid: LiquidStep | None,
     ) -> tuple[HallSums, dict[str, Any], dict[str, Any]]:
         """Continue with air of an earlier step where a data center is beyond its limits.
 
@@ -264,9 +277,10 @@ class Simulator:
             air: Results of the halls.
             thermal: Temperatures at the end of the step.
             plant: Results of the facility.
+            liquid: Liquid cooling, which does not change; None for fleets without it.
 
         Returns:
-            The last three arguments with the values of these data centers replaced.
+            ``air``, ``thermal`` and ``plant`` with the values of these data centers replaced.
         """
         fleet, stages = self.fleet, self._started()
         hottest_c = np.maximum.reduceat(air.rack_outlet_max_c, fleet.rack_offsets[:-1])
@@ -277,7 +291,7 @@ class Simulator:
         if last is None:
             last = plain_supply_air(air, supply, fleet)
         air, thermal = held_air(air, thermal, beyond, last=last, state=state, fleet=fleet)
-        plant = stages.facility.step(state, commands, surroundings, supply, air)
+        plant = stages.facility.step(state, commands, surroundings, supply, air, liquid)
         plant["within_limits"] = np.where(beyond, 0.0, plant["within_limits"])
         self._beyond = beyond
         return air, thermal, plant
@@ -309,8 +323,11 @@ class Simulator:
             RuntimeStateError: No step has been done.
             SdcError: ``into`` has a wrong shape, type or memory order, or is read-only.
         """
-        hall = self._started().hall
-        return self._with_held(hall.servers(into), self.fleet.per_rack_servers())
+        stages = self._started()
+        layers, per_rack = stages.hall.servers(into), self.fleet.per_rack_servers()
+        if stages.liquid is not None and self._liquid is not None:
+            stages.liquid.add_power(layers.power_w, per_rack, self._liquid)
+        return self._with_held(layers, per_rack)
 
     def server_groups(self) -> ServerLayers:
         """Return inlet, outlet and power of one server of each group in the last step, (G,) each.
@@ -320,8 +337,11 @@ class Simulator:
         Raises:
             RuntimeStateError: No step has been done.
         """
-        groups = self._started().hall.groups()
-        return self._with_held(groups, np.diff(self.fleet.group_offsets))
+        stages = self._started()
+        layers, per_rack = stages.hall.groups(), np.diff(self.fleet.group_offsets)
+        if stages.liquid is not None and self._liquid is not None:
+            stages.liquid.add_power(layers.power_w, per_rack, self._liquid)
+        return self._with_held(layers, per_rack)
 
     def _with_held(self, layers: ServerLayers, per_rack: npt.NDArray[Any]) -> ServerLayers:
         """Overwrite layers of data centers beyond their limits with means of their racks.
@@ -472,6 +492,8 @@ class Simulator:
         if self._stages is not None:
             self._stages.transfer.close()
             self._stages.workload.close()
+            if self._stages.liquid is not None:
+                self._stages.liquid.close()
         self._stages = self._state = self._drivers = self._last_air = self._first_state = None
 
     def __enter__(self) -> Self:
@@ -565,7 +587,6 @@ def _next_state(
         rack_status=racks.rack_status.copy(),
         restart_wait_min=racks.restart_wait_min,
         **thermal,
-        **no_liquid_state(),
     )
 
 

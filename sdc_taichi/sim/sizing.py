@@ -19,6 +19,7 @@ from sdc_taichi.plant.tower import TOWERS, TowerDesignPoint, design_water_kg_s
 from sdc_taichi.plant.water_side import WaterSideDesign, hydraulic_pump_w
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.liquid_fleet import liquid_design
 from sdc_taichi.types import F64, fields_of
 
 WATER_DENSITY_KG_M3 = 1000.0
@@ -150,12 +151,17 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     """
     v = fleet.values
     full = _solve(fleet, hall, v("hall.design_supply_c"), np.ones(fleet.size))
-    it_w = full.cpu_w + full.it_fan_w
+    it_w = air_w = full.cpu_w + full.it_fan_w
+    liquid_overhead_w: F64 | float = 0.0
+    if fleet.liquid is not None:
+        liquid = liquid_design(fleet.liquid)
+        it_w, air_w = air_w + liquid.liquid_w, air_w + liquid.to_air_w
+        liquid_overhead_w = liquid.overhead_w
     crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
     # With spare units, all units run at part speed.
     crac_at_design_w = crac_fan_w * fleet.design_speed**3
-    cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
+    cooling_w = (air_w + crac_at_design_w) * v("hvac.sizing.margin")
     pump_heat_w = v("hvac.pumps.heat_to_water_share") * _chilled_pump_w(fleet, cooling_w)
     chiller_w, at_design, fullest_c = _design_chiller(
         fleet, cooling_w + pump_heat_w, outdoor_c, wet_bulb_c
@@ -173,6 +179,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         + water_side.tower_fan_w
         + water_side.chilled_pump_w
         + water_side.condenser_pump_w
+        + liquid_overhead_w
     )
     hours = v("battery.hours_of_design_load")
     return Sizing(

@@ -18,7 +18,7 @@ from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.facility import Facility, FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
-from sdc_taichi.sim.liquid_halls import no_liquid_state
+from sdc_taichi.sim.liquid_halls import LiquidHalls, LiquidStep, no_liquid_state
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.step_inputs import ActionDecoder, SurroundingsModel, UnitIndex
@@ -53,6 +53,8 @@ class Stages:
     """Air model of the halls, quasi-steady or transient."""
     facility: FacilityStage
     """Models of plant, water, battery, grid and carbon."""
+    liquid: LiquidHalls | None
+    """Model of liquid-cooled racks; None for fleets without any."""
 
     def initial_state(
         self, fleet: Fleet, seeds: I64, drivers: Drivers, loads: RackLoads | None = None
@@ -69,6 +71,11 @@ class Stages:
         demand, rack_load = drivers.at(0).demand, None
         if loads is not None:
             demand, rack_load = loads.demand, loads.rack_load
+        liquid = no_liquid_state()
+        if self.liquid is not None:
+            weather = drivers.at(0)
+            each = demand[fleet.rack_dc] if rack_load is None else rack_load
+            liquid = self.liquid.initial((weather.outdoor_c, weather.wet_bulb_c), each)
         return State(
             step=0,
             seed=seeds,
@@ -84,7 +91,7 @@ class Stages:
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
             restart_wait_min=self.allocation.initial_wait_min(),
             **self.air.initial(supply, demand, rack_load),
-            **no_liquid_state(),
+            **liquid,
         )
 
 
@@ -105,6 +112,7 @@ def make_stages(
     hall, units = Hall(fleet, precision), UnitIndex(fleet)
     sizing = size(fleet, hall, drivers.design_outdoor_c, drivers.design_wet_bulb_c)
     hall.discard_last_step()
+    liquid = None if fleet.liquid is None else LiquidHalls(fleet, hall)
     allocation = WorkAllocation(fleet)
     models = Facility(fleet, sizing, event_free=event_free)
     facility = FacilityStage(fleet, models)
@@ -125,6 +133,7 @@ def make_stages(
         crac_units=CracUnits(fleet, units),
         air=air,
         facility=facility,
+        liquid=liquid,
     )
 
 
@@ -194,8 +203,7 @@ class SteadyFacility:
         self._commands = stages.decoder.decode(None)
         timeline = schedule(
             fleet.configs,
-            rack_offsets=fleet.rack_offsets,
-            unit_offsets=fleet.unit_offsets,
+            fleet.places,
             steps_per_hour=fleet.steps_per_hour,
             seed=0,
         )
@@ -203,6 +211,7 @@ class SteadyFacility:
             inputs.at(0), timeline.at(0), self._state.stored_kwh
         )
         self._supply = stages.crac_units.initial_supply()
+        self._liquid: LiquidStep | None = None
         self._air = self._solve_air()
         self.inlet_max_c: F64 = self._air.inlet_max_c
         """Highest server inlet temperature of each copy, in C, (B,)."""
@@ -219,8 +228,16 @@ class SteadyFacility:
             wet_bulb_c: Outdoor wet bulb, in C, (B,).
         """
         self._surroundings.outdoor_c, self._surroundings.wet_bulb_c = outdoor_c, wet_bulb_c
+        if self._liquid is not None:
+            # The heat that liquid-cooled racks leave to the air depends on the weather.
+            self._air = self._solve_air()
         results = self._stages.facility.step(
-            self._state, self._commands, self._surroundings, self._supply, self._air
+            self._state,
+            self._commands,
+            self._surroundings,
+            self._supply,
+            self._air,
+            self._liquid,
         )
         possible = (results["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
         return SteadyStep(
@@ -232,6 +249,8 @@ class SteadyFacility:
     def close(self) -> None:
         """Release the kernel arrays."""
         self._stages.workload.close()
+        if self._stages.liquid is not None:
+            self._stages.liquid.close()
 
     def _solve_air(self) -> HallSums:
         """Solve airflows, temperatures and power of the halls at their constant load."""
@@ -246,6 +265,8 @@ class SteadyFacility:
         placement = stages.allocation.place(
             self._state, self._commands, surroundings, work, capacity
         )
+        if stages.liquid is not None:
+            self._liquid = stages.liquid.step(self._state, self._commands, surroundings, placement)
         air, _ = stages.air.solve(self._state, placement, self._supply, surroundings)
         return air
 

@@ -324,6 +324,19 @@ class Surroundings(SiteQuantities):
     rack_airflow: F64 | None
     """Remaining airflow of each rack's fans as a share of full airflow, 0..1, (R,); None means
     full airflow."""
+    cdu_up: F64 | None = None
+    """1 for CDUs that have not failed, else 0, (C,); None means that nothing of the liquid cooling
+    has failed, as for the four fields below."""
+    cdu_pump_up: F64 | None = None
+    """1 for CDUs of which all pumps work, else 0, (C,)."""
+    facility_pump: F64 | None = None
+    """Share of the pumps of the facility water that work, 0..1, (B,)."""
+    cooler_share: F64 | None = None
+    """Share of the fans that cool the facility water that work, 0..1, (B,)."""
+    rack_leaks: npt.NDArray[np.bool_] | None = None
+    """True for each liquid-cooled rack that leaks, (L,)."""
+    leaked_l: F64 | None = None
+    """Coolant lost by leaks in the step, in l, (B,)."""
 
 
 class SurroundingsModel:
@@ -395,4 +408,20 @@ class SurroundingsModel:
             no_unit_down=self._units.lowest(unit_running),
             all_running=bool(np.all(running)),
             rack_airflow=event.rack_airflow,
+            **self._liquid_failures(event),
         )
+
+    @staticmethod
+    def _liquid_failures(event: Disturbance) -> dict[str, Any]:
+        """Return failures of liquid cooling by their fields of ``Surroundings``."""
+        works = event.cdu_up.all() and event.cdu_pump_up.all() and not event.rack_leaks.any()
+        if works and np.all((event.facility_pump == 1.0) & (event.cooler_share == 1.0)):
+            return {}
+        return {
+            "cdu_up": event.cdu_up.astype(np.float64),
+            "cdu_pump_up": event.cdu_pump_up.astype(np.float64),
+            "facility_pump": event.facility_pump,
+            "cooler_share": event.cooler_share,
+            "rack_leaks": event.rack_leaks,
+            "leaked_l": event.leaked_l,
+        }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -59,6 +59,15 @@ class RackOutcome(RackQuantities):
     no protection."""
 
 
+class LiquidOutcome(Protocol):
+    """Effects of liquid cooling on R racks and the work of B data centers, see ``LiquidStep``."""
+
+    tripped: Mask
+    has_coolant: Mask
+    throttled_tasks: F64
+    without_room_tasks: F64
+
+
 class WorkAllocation:
     """Distributes work over the racks of a fleet, and applies their thermal protection.
 
@@ -81,7 +90,7 @@ class WorkAllocation:
         classes = [c.protection.ashrae_class for c in fleet.configs]
         limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
         trip_c = limit_c + fleet.values("protection.trip_margin_k")
-        self._protected = bool(np.any(np.isfinite(limit_c)))
+        self._protected = bool(np.any(np.isfinite(limit_c))) or fleet.liquid is not None
         outlet_limit_c = fleet.values("protection.outlet_limit_c")
         unlimited = np.isnan(outlet_limit_c) | np.isinf(limit_c)
         outlet_trip_c = np.where(unlimited, np.inf, fleet.values("protection.outlet_trip_c"))
@@ -182,6 +191,7 @@ class WorkAllocation:
         placement: Placement,
         air: HallSums,
         plant: Mapping[str, Any],
+        liquid: LiquidOutcome | None = None,
     ) -> RackOutcome:
         """Throttle, trip and restart racks by their hottest inlets and outlets.
 
@@ -192,6 +202,7 @@ class WorkAllocation:
             placement: Placement of the work.
             air: Hall results with the hottest inlet and outlet of each rack.
             plant: Plant results by name, with total and unmet cooling load.
+            liquid: Effects of liquid cooling on racks and work; None for fleets without it.
         """
         lost_share = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
         before, status = state.rack_status, state.rack_status.copy()
@@ -204,6 +215,8 @@ class WorkAllocation:
             restarts = np.zeros(len(before), np.bool_)
             if (before == TRIPPED).any():
                 cooled = self._is_cooled(surroundings, plant)[self._fleet.rack_dc] & ~fans_failed
+                if liquid is not None:
+                    cooled &= liquid.has_coolant
                 restarts, wait_min = self._restart(before, wait_min, inlet_max_c, cooled)
             status = protection.protect(
                 before,
@@ -214,15 +227,21 @@ class WorkAllocation:
                 fans_failed=fans_failed,
                 restarts=restarts,
             )
+            if liquid is not None:
+                status[liquid.tripped] = TRIPPED
             lost_share = lost_share + self._tripped_work(before, status, placement)
         lost_tasks = TASKS_PER_STEP * lost_share
+        executed_tasks = work.started_tasks - lost_tasks
+        if liquid is not None:
+            executed_tasks = executed_tasks - liquid.throttled_tasks
+            lost_tasks = lost_tasks + liquid.without_room_tasks
         return RackOutcome(
             restart_wait_min=wait_min,
             rack_status=status,
             throttled_racks=self._racks_in(status, THROTTLED),
             tripped_racks=self._racks_in(status, TRIPPED),
             lost_tasks=lost_tasks,
-            executed_tasks=work.started_tasks - lost_tasks,
+            executed_tasks=executed_tasks,
         )
 
     def _restart(

@@ -9,7 +9,7 @@ enters and leaves the queue.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -227,7 +227,7 @@ class Workload:
             lambda **x: fields_of(model.step(workload.WorkPoint(**x, **limits))), fleet.size
         )
         self._max_utilisation = v("workload.max_utilisation")
-        self._length = queue_length(fleet)
+        self._length, self._queue_limit = queue_length(fleet), limits["queue_limit"]
         shared = fleet.shared_work
         self._flexible_share = None if shared is None else limits["flexible_share"]
         delay_steps = 0 if shared is None else shared.delay_steps
@@ -285,6 +285,32 @@ class Workload:
             oldest_age_h=after.oldest_age_steps * self._step_h,
             mean_age_h=after.mean_age_steps * self._step_h,
         )
+
+    def put_back(self, work: WorkResult, tasks: F64) -> tuple[WorkResult, F64]:
+        """Put started work back into the queues, as work that arrived in this step.
+
+        Args:
+            work: Work of the step.
+            tasks: Work to put back, in tasks, (B,).
+
+        Returns:
+            Work of the step with the queues after that, and work that finds no room, in tasks,
+            (B,).
+        """
+        room = np.maximum(self._queue_limit - work.queue_tasks, 0.0)
+        back = np.minimum(tasks, room)
+        if not back.any():
+            return work, tasks - back
+        queue, waiting = work.queue.copy(), work.queue_tasks + back
+        queue[:, -1] += back
+        some = np.where(waiting > 0.0, waiting, 1.0)
+        after = replace(
+            work,
+            queue=queue,
+            queue_tasks=waiting,
+            mean_age_h=work.mean_age_h * (work.queue_tasks / some),
+        )
+        return after, tasks - back
 
     def close(self) -> None:
         """Release the kernel arrays."""
