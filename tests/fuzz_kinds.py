@@ -747,6 +747,16 @@ def options_of_environment(rng: Generator, form: str) -> dict[str, Any]:
             commands = {}
             if "crac" in options["agents"]:
                 options["neighbours"] = int(rng.integers(0, 4))
+        if config.liquid is not None and rng.random() < 0.6:
+            groups = ["plant", "cdu", "power_cap"]
+            options["agents"] = [x for x in groups if rng.random() < 0.6] or ["cdu"]
+            others = pick(rng, ("idle", "liquid=liquid-reset", "liquid=liquid-wet-bulb"))
+            options |= {"rewards": pick(rng, ("default", "bill")), "others": others}
+            if set(options["agents"]) == set(groups):
+                options["others"] = "idle"
+            of_plant = {"plant": ["facility_approach_k", "reuse_share"]}
+            commands = of_plant if "plant" in options["agents"] else {}
+            options.pop("neighbours", None)
         if config.fleet is not None and options["rewards"] != "bill":
             options["agents"] = [*options["agents"], "agent_geo"]
             options.pop("others", None)

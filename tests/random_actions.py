@@ -21,6 +21,7 @@ from sdc_taichi.envs.agents import AGENTS
 
 PLACED = {"workload.placement": "weights"}
 FANS = {"hvac.crac.flow_model": "controlled"}
+_OF_LOOPS = {"agents": ["agent_ls", "plant", "cdu", "power_cap"], "actions": "continuous"}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, list[str]], dict[str, Any]]] = {
     "discrete": ({}, {}, {}),
     "continuous": ({}, {}, {"actions": "continuous"}),
@@ -31,6 +32,12 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, list[str]], dict[str, Any]]] = 
         {},
         {"crac": ["fan", "cooling"], "plant": ["chilled_water"]},
         {"agents": ["crac", "plant"], "actions": "continuous", "neighbours": 2},
+    ),
+    "loops": ({}, {"plant": ["facility_approach_k", "reuse_share"]}, _OF_LOOPS),
+    "discrete loops": (
+        {},
+        {"plant": ["facility_approach_k", "reuse_share"]},
+        {"agents": ["plant", "cdu", "power_cap"]},
     ),
     "sites": ({}, {}, {"agents": [*AGENTS, "agent_geo"], "actions": "continuous"}),
 }
@@ -46,6 +53,7 @@ def cases() -> Iterator[tuple[str, str]]:
             "fans": config.hall.inlet_model == "recirculation" and not of_units,
             "placement": not of_units,
             "units": of_units,
+            "loops": config.liquid is not None,
             "sites": config.fleet is not None,
         }
         yield from ((preset, kind) for kind in KINDS if has.get(kind.split()[-1], True))

@@ -267,7 +267,8 @@ def test_a_site_sends_work_to_the_cleanest_site_first(rewards_of: Any) -> None:
     idle = [f"{name}/agent_geo" for i, name in enumerate(names) if i != dirtiest]
     assert [rewards[name] for name in idle] == [0.0, 0.0]
     assert AGENT_DEFINITIONS["agent_geo"].scales["bill"] == {"geo_cost": 10.0, "high_power": 10.0}
-    assert list(OF_DATA_CENTERS) == ["hall_power", "hall_heat", "geo_carbon", "geo_cost"]
+    terms = ["hall_power", "hall_heat", "hot_junctions", "geo_carbon", "geo_cost"]
+    assert list(OF_DATA_CENTERS) == terms
 
 
 def test_agents_of_a_site_whose_links_are_down_do_not_act() -> None:

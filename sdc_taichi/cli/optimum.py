@@ -163,6 +163,8 @@ def optimum_command(
             print(metrics_json(optimum_content(optimum, reached)))
         elif not quiet:
             _print_optimum(optimum_content(optimum, reached), fleet.steps_per_hour)
+            if fleet.cdus:
+                _print_loops(sim, aim, steps)
         is_written = False
         if out is not None and not interrupted():
             with progress_bar(steps, shown=not quiet) as advance:
@@ -353,6 +355,40 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
     console.print(figures_table(console, titles, names, columns, total, "z.2f"))
     for line in first_lines(optimum_remarks(content), MOST_LINES, ", see --json"):
         console.print(line)
+
+
+def _print_loops(sim: Simulator, objective: Objective, steps: int) -> None:
+    """Print a line on the optimum of coolant loops of each data center, or why there is none.
+
+    Args:
+        sim: the simulator of the data centers.
+        objective: what to minimise.
+        steps: number of steps.
+    """
+    from sdc_taichi.optimum.loop_optimum import loop_optimum
+    from sdc_taichi.sim.fleet import build_fleet
+
+    for dc, name in enumerate(sim.fleet.names):
+        try:
+            one = sim.drivers.take([dc])
+            found = loop_optimum(
+                build_fleet(sim.fleet.configs[dc]),
+                one,
+                start=one.start,
+                steps=steps,
+                objective=objective,
+                precision=sim.precision,
+            )
+        except ConfigError as error:
+            print(error)
+            continue
+        bound, achieved = (
+            100.0 * (float(x[0] / found.idle[0]) - 1.0) for x in (found.bound, found.achieved)
+        )
+        print(
+            f"{name}: coolant loops alone, over all steps: bound {bound:.2f} %, achieved "
+            f"{achieved:.2f} % against idle"
+        )
 
 
 def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[float | None]:

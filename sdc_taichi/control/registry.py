@@ -13,6 +13,12 @@ import numpy as np
 
 from sdc_taichi.control.geo import Alone, Central, all_cleaner, all_to_cleanest, three_cleanest
 from sdc_taichi.control.hall_rules import HALL_RULES, hall_rule, is_hall_rule
+from sdc_taichi.control.liquid_rules import (
+    GreedyLoops,
+    JunctionReset,
+    WetBulbApproach,
+    require_liquid,
+)
 from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
     COMMANDS_OF_PART,
@@ -42,8 +48,9 @@ from sdc_taichi.user_functions import check_code, import_path, imported, registe
 CONTROLLABLE: tuple[Agent, ...] = AGENTS
 """Parts of a controller spec such as ``load=NAME`` that every data center has, named like commands
 of ``Actions``."""
-PARTS = (*CONTROLLABLE, "geo")
-"""All valid parts of a controller spec; ``geo`` sends work between the sites of a fleet."""
+PARTS = (*CONTROLLABLE, "geo", "liquid")
+"""All valid parts of a controller spec; ``geo`` sends work between the sites of a fleet, and
+``liquid`` commands liquid-cooled racks."""
 ControllerMaker = Callable[[str, Fleet, tuple[str, ...]], Controller]
 """Function that makes a controller. Its arguments are the text after the colon of the controller's
 name, the data centers, and the parts of the spec that use this name."""
@@ -71,6 +78,9 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "geo-three-cleanest": _NamedController(lambda: Alone(three_cleanest), ("geo",)),
     "geo-all-cleaner": _NamedController(lambda: Alone(all_cleaner), ("geo",)),
     "geo-central": _NamedController(Central, ("geo",)),
+    "liquid-wet-bulb": _NamedController(WetBulbApproach, ("liquid",)),
+    "liquid-reset": _NamedController(JunctionReset, ("liquid",)),
+    "liquid-greedy": _NamedController(GreedyLoops, ("liquid",)),
     "geo-mpc": _NamedController(lambda: _fleet_predictive(), ("load", "cooling", "geo")),
 }
 _CONSTANT = "constant:C"
@@ -102,7 +112,8 @@ def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> 
         name: Identifier; a spec ``name:TEXT`` passes TEXT to the maker.
         maker: Function that returns the controller, class without constructor arguments, or import
             path ``module:name`` of either. A function is called with the text after the colon, the
-            fleet, and the parts of the spec (load, cooling, battery, geo) that use the name.
+            fleet, and the parts of the spec (load, cooling, battery, geo, liquid) that use the
+            name.
 
     Raises:
         ConfigError: The name is taken, or ``maker`` is neither a function nor a class.
@@ -242,9 +253,12 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
     agent = _first_missing(parts, entry.parts)
     if agent is not None:
         able = [n for n, e in _CONTROLLERS.items() if agent in e.parts]
-        able += {"cooling": [*HALL_RULES, _CONSTANT, _MPC, _POLICY], "geo": []}.get(
-            agent, [_MPC, _POLICY]
-        )
+        of_part = {
+            "cooling": [*HALL_RULES, _CONSTANT, _MPC, _POLICY],
+            "geo": [],
+            "liquid": [_POLICY],
+        }
+        able += of_part.get(agent, [_MPC, _POLICY])
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )
@@ -253,6 +267,8 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
             f"controller {name!r}: the data centers share no work; valid with a config that has "
             "section fleet, such as preset fleet_of_eight"
         )
+    if name.startswith("liquid-"):
+        require_liquid(name, fleet)
     return entry.make()
 
 
@@ -306,7 +322,8 @@ def _made_by_maker(
         made = maker(text, fleet, parts or CONTROLLABLE)
     controller = check_controller(made, f"controller {name!r}")
     commands = commands_of(controller)
-    acts_on = [*commands, *(["geo"] if "transfer" in commands else [])]
+    beyond = ("geo", "liquid")
+    acts_on = [*commands, *(p for p in beyond if not set(COMMANDS_OF_PART[p]).isdisjoint(commands))]
     agent = _first_missing(parts, acts_on)
     if agent is not None:
         raise ConfigError(

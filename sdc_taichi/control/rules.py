@@ -17,6 +17,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.plant.cooling import avoid_repeats
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
@@ -31,6 +32,7 @@ COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "cooling": ("cooling", "fan", "placement", "chilled_water"),
     "battery": ("battery",),
     "geo": ("transfer",),
+    "liquid": tuple(LIQUID_COMMANDS),
 }
 """Fields of ``Actions`` that each part of ``PerAgent`` may give."""
 _DRAWN_STEPS = 256
@@ -217,7 +219,7 @@ class GreedyCarbon(WithoutMemory):
 
 
 class PerAgent:
-    """Combination of one controller each for load, cooling, battery, and transfers.
+    """Combination of one controller each for load, cooling, battery, transfers and liquid cooling.
 
     A controller that is used for several of them acts only once per step.
 
@@ -227,6 +229,7 @@ class PerAgent:
             them.
         battery: Controller of the battery command.
         geo: Controller of the transfers between sites of a fleet; None sends nothing.
+        liquid: Controller of the commands for liquid-cooled racks; None gives none.
 
     Attributes:
         commands: Fields of ``Actions`` that the controllers give.
@@ -241,8 +244,10 @@ class PerAgent:
         cooling: Controller,
         battery: Controller,
         geo: Controller | None = None,
+        liquid: Controller | None = None,
     ) -> None:
         parts = {"load": load, "cooling": cooling, "battery": battery, "geo": geo or Idle()}
+        parts["liquid"] = liquid or Idle()
         self._giver: dict[str, Controller] = {}
         for part, controller in parts.items():
             for command in COMMANDS_OF_PART[part]:

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from sdc_taichi.control.coolant_loops import CoolantLoops, LoopReadings, lowest
 from sdc_taichi.control.unit_zones import UnitZones, ZoneReadings
 from sdc_taichi.errors import ConfigError, RuntimeStateError, suggestion
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
@@ -258,6 +259,8 @@ class View:
     send nor get work, (B,)."""
     zone_loads: ZoneLoads | None
     """Loads of the zones of halls, see ``workload.zone_loads``; None without any."""
+    loops: CoolantLoops | None
+    """Racks and CDUs of the coolant loops, shared by all views of an episode; None without any."""
     forecast_error: ForecastError = PERFECT
     """Standard deviations of the forecast errors."""
     walks: RandomWalks | None = None
@@ -302,6 +305,39 @@ class View:
     def unit_running(self) -> F64:
         """1 for CRAC units that ran in the last step, 0 for units that were down, (U,)."""
         return self._zone_readings.unit_running
+
+    @property
+    def cdu_running(self) -> F64:
+        """1 for CDUs through which coolant flowed in the last step, else 0, (C,); before it 1."""
+        return self._loop_readings.running
+
+    @property
+    def cdu_return_c(self) -> F64:
+        """Temperature of the coolant from the racks to each CDU in the last step, in C, (C,)."""
+        return self._loop_readings.return_c
+
+    @property
+    def cdu_junction_c(self) -> F64:
+        """Hottest GPU junction of the racks that each CDU serves, in C, (C,)."""
+        return self._loop_readings.junction_c
+
+    @property
+    def cdu_headroom_k(self) -> F64:
+        """Smallest throttling limit minus junction of the racks that each CDU serves, in K, (C,).
+
+        It is inf for CDUs that serve no GPUs.
+        """
+        return self._loop_readings.headroom_k
+
+    @property
+    def junction_headroom_k(self) -> F64:
+        """Smallest throttling limit minus junction of the GPUs, in K, (B,); inf without GPUs."""
+        return lowest(self.cdu_headroom_k, self.fleet.cdu_offsets)
+
+    @property
+    def _loop_readings(self) -> LoopReadings:
+        assert self.loops is not None
+        return self.loops.readings(self.last, self.state)
 
     @property
     def nearest_units(self) -> I64:
@@ -390,6 +426,7 @@ def view_maker(
     limits, sizing = limits_of(sim.fleet), sim.sizing
     walks: RandomWalks | None = None
     zones, even = UnitZones(sim.fleet), np.ones(sim.fleet.units)
+    loops = CoolantLoops(sim.fleet) if sim.fleet.cdus else None
     has_fans = sim.fleet.models["crac_flow"] == "controlled"
     sites = sim.fleet.sites_per_fleet
     no_flows, all_up = np.zeros((sim.size // sites, sites, sites)), np.ones(sim.size)
@@ -412,6 +449,7 @@ def view_maker(
             sim.flows_tasks().copy() if last is not None and sites > 1 else no_flows,
             sim.link_up() if sites > 1 else all_up,
             sim.zone_loads,
+            loops,
             forecast_error,
             walks,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from sdc_taichi.config.liquid_schema import POWER_CAP_LIMITS, LiquidConfig
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.site_order import cleaner_first, shares_of_sites
@@ -18,6 +19,7 @@ from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 from sdc_taichi.types import F64, Actions, State
 
 BATTERY_COMMANDS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
@@ -27,8 +29,16 @@ PLACEMENT_FACTOR = 10.0
 """Placement weight of a rack at a continuous action of 1; an action of -1 gives the reciprocal."""
 _NEUTRAL = {"placement": 1.0}
 """Neutral values of the commands that are not neutral at 0."""
+_NEUTRAL_LIQUID: dict[str, Callable[[LiquidConfig], float]] = {
+    "facility_approach_k": lambda liquid: liquid.cdus.approach_k,
+    "reuse_share": lambda liquid: liquid.reuse.share,
+    "power_cap": lambda liquid: POWER_CAP_LIMITS[1],
+}
+"""Values of the commands for liquid cooling at an action of 0, which are those without command."""
 CHILLED_WATER_SPAN_K = 6.0
 """Difference from the warmest possible chilled water to that of a continuous action of -1, in K."""
+LARGEST_MOVES = {"cdu_setpoint_c": 2.0, "cdu_flow": 0.1}
+"""Change of a CDU's setpoint, in K, and of its flow as a share of design, by an action of 1."""
 _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
 """Simulation stage, and the model of this stage, that a command requires."""
 
@@ -91,14 +101,14 @@ class AgentActions:
             order = "sustaindc" if models == {"released"} else "paper"
         self.action_order = order
         three_ways = np.array([-1.0, 0.0, 1.0])
-        self._discrete_commands = {
-            "load": three_ways,
-            "cooling": three_ways,
-            "fan": three_ways,
+        self._discrete_commands = dict.fromkeys(self.commands, three_ways) | {
             "battery": np.array(BATTERY_COMMANDS[order]),
             "placement": PLACEMENT_FACTOR**three_ways,
-            "chilled_water": three_ways,
-            "transfer": three_ways,
+        }
+        self._neutral_liquid = {
+            name: np.array([neutral(c.liquid) for c in fleet.configs if c.liquid is not None])
+            for name, neutral in _NEUTRAL_LIQUID.items()
+            if name in self.commands
         }
         self._setpoint_change_k = options.setpoint_change_k
         self._setpoint_step_k = fleet.values("hvac.setpoint.step_k")[fleet.unit_dc]
@@ -137,6 +147,8 @@ class AgentActions:
         if "chilled_water" in commands:
             reset = commands["chilled_water"]
             commands["chilled_water"] = self._chilled_water_c(reset, commands, state)
+        for name in commands.keys() & LIQUID_COMMANDS.keys():
+            commands[name] = self._liquid_command(name, commands[name], state)
         if "transfer" in commands:
             shares = np.maximum(commands["transfer"], 0.0).reshape(view.size, -1)
             commands["transfer"] = shares_of_sites(shares, view)
@@ -160,7 +172,10 @@ class AgentActions:
             width = self._widths[agent]
             parts = []
             for name, columns in self._columns[agent]:
-                command = as_numbers(getattr(commands, name), _NEUTRAL.get(name, 0.0))
+                given = getattr(commands, name)
+                command = as_numbers(given, _NEUTRAL.get(name, 0.0))
+                if name in LIQUID_COMMANDS and given is not None:
+                    command = self._liquid_action(name, command, view.state)
                 if name == "transfer" and command.ndim:
                     command = np.take_along_axis(command, cleaner_first(view), axis=1)
                 count = width if columns is None else columns.stop - columns.start
@@ -229,6 +244,31 @@ class AgentActions:
         most_c = coldest_c - fleet.setpoint_over_supply_k - self._coil_approach_k
         chilled_c = most_c + CHILLED_WATER_SPAN_K * np.minimum(reset, 0.0)
         return np.asarray(np.clip(chilled_c, low_c, high_c))
+
+    def _liquid_command(self, name: str, action: F64, state: State) -> F64:
+        """Return the value of a command for liquid cooling, (C,) or (B,).
+
+        An action of a CDU is a change of setpoint or flow. Of all other commands -1, 0 and 1 mean
+        the lowest, the neutral and the highest value, with straight lines in between.
+        """
+        low, high = LIQUID_COMMANDS[name][1]
+        if name in LARGEST_MOVES:
+            moved = getattr(state, name) + LARGEST_MOVES[name] * action
+            return np.asarray(np.clip(moved, low, high))
+        neutral = self._neutral_liquid[name]
+        span = np.where(action > 0.0, high - neutral, neutral - low)
+        return np.asarray(np.clip(neutral + span * action, low, high))
+
+    def _liquid_action(self, name: str, command: F64, state: State) -> F64:
+        """Return the action that gives a command for liquid cooling, in -1..1."""
+        low, high = LIQUID_COMMANDS[name][1]
+        if name in LARGEST_MOVES:
+            if command.shape == (self._fleet.size,):
+                command = command[self._fleet.cdu_dc]
+            return np.asarray((command - getattr(state, name)) / LARGEST_MOVES[name])
+        above = command - self._neutral_liquid[name]
+        span = np.where(above > 0.0, high - command + above, command - above - low)
+        return np.asarray(above / np.where(span > 0.0, span, 1.0))
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
         """Neutral actions of the learning agents, (B,) or (B, k)."""
@@ -345,6 +385,13 @@ def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
     Raises:
         ConfigError: the error names the field of the config, its value and the valid value.
     """
+    of_liquid = [name for name in commands if name in LIQUID_COMMANDS]
+    dry = [c.name for c in fleet.configs if c.liquid is None]
+    if of_liquid and dry:
+        raise ConfigError(
+            f"commands: {of_liquid[0]} needs liquid-cooled racks; {dry[0]} has none, valid is a "
+            "config with section liquid, such as preset ai_hall_2026"
+        )
     for name, (stage, needed) in _NEEDED_MODELS.items():
         model = fleet.models[stage]
         if name in commands and model != needed:

@@ -2,7 +2,7 @@
 
 The agents of a group have the same spaces, and by default one policy. A group has one agent for
 each data center, which has the name of the group, or one for each CRAC unit (``crac_0``,
-``crac_1`` and so on).
+``crac_1`` and so on) or coolant distribution unit (``cdu_0`` and so on).
 """
 
 from __future__ import annotations
@@ -11,15 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS
+from sdc_taichi.types import CDUS, CRAC_UNITS, DATA_CENTERS
 
-Agent = Literal["agent_ls", "agent_dc", "agent_bat", "agent_geo", "crac", "plant"]
+Agent = Literal[
+    "agent_ls", "agent_dc", "agent_bat", "agent_geo", "crac", "plant", "cdu", "power_cap"
+]
 """Name of a group of agents. The first three are the agents of the released SustainDC: load
 shifting, cooling, battery."""
 AGENTS: tuple[str, ...] = get_args(Agent)[:3]
 """Groups that learn by default, in the order of their actions and observations."""
 HALL_AGENTS: tuple[str, ...] = ("crac", "plant")
 """Groups that control the cooling of a hall in place of ``agent_dc``."""
+LIQUID_AGENTS: tuple[str, ...] = ("cdu", "power_cap")
+"""Groups that control liquid-cooled racks beside those that control the air."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +40,9 @@ class AgentDefinition:
     scales: dict[str, dict[str, float]]
     """Factors of an agent's reward terms, by reward set and term."""
     axis: str = DATA_CENTERS
-    """Kind of element for which the group has an agent each: data centers or CRAC units."""
+    """Kind of element for which the group has an agent each: data centers, CRAC units or CDUs."""
+    decided: int = 1
+    """Number of commands that an agent sets by default, the first ones."""
     also_controlled: tuple[str, ...] = ()
     """Fields of ``Actions`` that no agent of the group sets, but a controller in its place."""
 
@@ -47,8 +53,13 @@ class AgentDefinition:
 
     @property
     def command(self) -> str:
-        """Field of ``Actions`` that an agent sets by default."""
+        """First field of ``Actions`` that an agent sets by default."""
         return self.commands[0]
+
+    @property
+    def default_commands(self) -> tuple[str, ...]:
+        """Names of all fields of ``Actions`` that an agent sets by default."""
+        return self.commands[: self.decided]
 
     @property
     def controlled(self) -> tuple[str, ...]:
@@ -69,7 +80,22 @@ _OWN_UNIT = (
     *("zone_hottest", "zone_mean", "tile_pressure", "neighbours"),
 )
 _TEAM_OF_HALL = {"hall_power": 1.0, "hall_heat": 0.2}
+_HOT_RACKS = {"throttled_work": 20.0, "hot_junctions": 0.1, "hot_inlets": 0.1}
+TEAM_OF_LIQUID: dict[str, dict[str, float]] = {
+    "default": {"cooling_carbon": 10.0, **_HOT_RACKS},
+    "bill": {"cooling_cost": 10.0, "high_power": 10.0, "heat_sales": 10.0, **_HOT_RACKS},
+}
+"""Factors of the reward terms by reward set that all agents of a hall share if some of them
+control liquid cooling."""
 _HALL = ("zone_hottest_highest", "unit_speed_highest", "unit_speed_mean")
+_OWN_CDU = (
+    *("cdu_setpoint", "cdu_supply", "cdu_return", "cdu_flow", "cdu_valve", "cdu_running"),
+    *("cdu_junction", "cdu_headroom"),
+)
+_LOOP = (
+    *("facility_supply", "facility_return", "trim_load", "heat_delivered", "heat_demand"),
+    *("heat_price", "junction_headroom"),
+)
 
 AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
     "agent_ls": AgentDefinition(
@@ -85,7 +111,7 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
     "agent_dc": AgentDefinition(
         part="cooling",
         commands=("cooling", "fan", "placement"),
-        also_controlled=("chilled_water",),
+        also_controlled=("chilled_water", "facility_approach_k", "reuse_share"),
         features=(*_CLOCK, "workload", *_CI, *_WEATHER, *_AIR, "it_energy", "hvac_energy"),
         scales={
             "default": {"cooling_carbon": 10.0, "hot_inlets": 0.1},
@@ -122,10 +148,35 @@ AGENT_DEFINITIONS: dict[str, AgentDefinition] = {
     ),
     "plant": AgentDefinition(
         part="cooling",
-        commands=("cooling", "chilled_water"),
-        features=("outdoor", "wet_bulb", "dc_load", *_HALL, "setpoint_mean", "chilled_water"),
+        commands=("cooling", "chilled_water", "facility_approach_k", "reuse_share"),
+        features=(
+            *("outdoor", "wet_bulb", "dc_load", *_HALL, "setpoint_mean", "chilled_water"),
+            *_LOOP,
+        ),
         scales={"default": _TEAM_OF_HALL},
         also_controlled=("placement",),
+    ),
+    "cdu": AgentDefinition(
+        part="liquid",
+        commands=("cdu_setpoint_c", "cdu_flow"),
+        features=(*_OWN_CDU, "facility_supply", "outdoor", "wet_bulb", "workload", "ci"),
+        scales=TEAM_OF_LIQUID,
+        axis=CDUS,
+        decided=2,
+    ),
+    "power_cap": AgentDefinition(
+        part="liquid",
+        commands=("power_cap",),
+        features=(
+            *_CLOCK,
+            "workload",
+            *_QUEUE,
+            *_CI,
+            "ci_change",
+            "it_energy",
+            "junction_headroom",
+        ),
+        scales=TEAM_OF_LIQUID,
     ),
 }
 """Definitions of all groups by name.
@@ -139,7 +190,8 @@ Reward set ``bill`` uses prices instead of carbon intensity and adds a charge fo
 set ``paper`` contains r_LS, r_DC and r_BAT of the paper (4.5, F.2), with carbon and energies
 divided by their values at the design point. In reward set ``own`` an agent of a CRAC unit has a
 part of the reward that all agents of a hall share in ``default``; all other agents have their
-rewards of ``default``.
+rewards of ``default``. If an agent controls liquid cooling, ``crac``, ``plant``, ``cdu`` and
+``power_cap`` share the rewards ``TEAM_OF_LIQUID``.
 """
 
 

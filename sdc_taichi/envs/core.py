@@ -34,6 +34,7 @@ from sdc_taichi.envs.actions import AgentActions, as_numbers
 from sdc_taichi.envs.agents import (
     AGENT_DEFINITIONS,
     HALL_AGENTS,
+    LIQUID_AGENTS,
     commands_by_others,
     members_of,
     present_agents,
@@ -63,10 +64,13 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError, whole_number
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
 from sdc_taichi.sim.drivers import local_start, utc_start
 from sdc_taichi.sim.events import require_events_start_before
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.fleet_configs import MOST_DCS, with_sites
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 from sdc_taichi.types import (
+    CDUS,
     CRAC_UNITS,
     F32,
     F64,
@@ -200,6 +204,7 @@ class Core:
             options.collaboration,
             agents=self.agents,
             days=options.days,
+            liquid=not LIQUID_COMMANDS.keys().isdisjoint(self._learned_commands),
         )
         # Plain values that identify the environment in saved states. Costs and the clipping of
         # actions are left out because they do not change an episode.
@@ -257,7 +262,7 @@ class Core:
             raise ConfigError("config: data centers of a part of a fleet; valid are whole fleets")
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
-        _check_others(options, self._others)
+        _check_others(options, self._others, fleet)
         _check_groups(options, self._sites)
         self._commands_of_others = commands_by_others(
             self.agents, self._learned_commands, commands_of(self._others)
@@ -587,12 +592,12 @@ class Core:
         in the last step, or if its unit does not exist.
         """
         masks: dict[str, npt.NDArray[np.bool_]] = {}
-        running = {CRAC_UNITS: self.view.unit_running}
         for agent in self.masked_groups:
             if (slots := self.slots.get(agent)) is None:
                 masks[agent] = self._by_env(self.view.link_up > 0)
             else:
-                units = running[AGENT_DEFINITIONS[agent].axis]
+                of_cdus = AGENT_DEFINITIONS[agent].axis == CDUS
+                units = self.view.cdu_running if of_cdus else self.view.unit_running
                 masks[agent] = (slots.fill(units) > 0) & slots.exists
         return masks
 
@@ -796,7 +801,7 @@ def _check_groups(options: EnvOptions, sites: int) -> None:
     """Refuse groups and observations that environments of a fleet do not have."""
     if sites == 1:
         return
-    of_hall = [agent for agent in options.agents if agent in HALL_AGENTS]
+    of_hall = [agent for agent in options.agents if agent in (*HALL_AGENTS, *LIQUID_AGENTS)]
     if of_hall:
         raise ConfigError(
             f"agents: {', '.join(of_hall)} in a fleet; valid with a data center alone, or agent_dc"
@@ -805,7 +810,7 @@ def _check_groups(options: EnvOptions, sites: int) -> None:
         raise ConfigError("heat_map True: in a fleet; valid with a data center alone, or False")
 
 
-def _check_others(options: EnvOptions, others: Controller) -> None:
+def _check_others(options: EnvOptions, others: Controller, fleet: Fleet) -> None:
     """Refuse a controller ``others`` that would have no effect.
 
     Raises:
@@ -814,7 +819,8 @@ def _check_others(options: EnvOptions, others: Controller) -> None:
     """
     if "others" not in options.model_fields_set:
         return
-    present = present_agents(options.agents)
+    absent = () if fleet.cdus else LIQUID_AGENTS
+    present = [agent for agent in present_agents(options.agents) if agent not in absent]
     # A part of which a group does not learn is still commanded by ``others``.
     open_parts = dict.fromkeys(
         AGENT_DEFINITIONS[a].part for a in present if a not in options.agents

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C
+from sdc_taichi.envs.view_terms import HIGHEST_RECOMMENDED_C, LEAST_HEADROOM_K
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
@@ -47,6 +47,22 @@ def throttled_racks(result: StepResult, view: View) -> F64:
     return (result.throttled_racks + result.tripped_racks) * result.step_h
 
 
+def junction_headroom(result: StepResult, view: View) -> F64:
+    """Lack of headroom of the hottest GPU junction below 5 K under its throttling limit, in K h."""
+    return np.maximum(LEAST_HEADROOM_K - view.junction_headroom_k, 0.0) * result.step_h
+
+
+def throttled_work(result: StepResult, view: View) -> F64:
+    """Work that GPUs at their temperature limit or power cap delay, in tasks."""
+    return result.throttled_tasks
+
+
+def dew_point(result: StepResult, view: View) -> F64:
+    """Lack of the lowest setpoint of CDUs to the dew point plus `liquid.dew_margin_k`, in K h."""
+    assert view.loops is not None
+    return view.loops.dew_shortfall_k(result, view.state) * result.step_h
+
+
 def overdue_work(result: StepResult, view: View) -> F64:
     """Work past its deadline, counted in each step, and work dropped or lost, in tasks."""
     return result.overdue_tasks + result.dropped_tasks + result.lost_tasks
@@ -72,12 +88,15 @@ def fleet_carbon(result: StepResult, view: View) -> F64:
     return shared.excess(emitted, shared.carbon_limit_g_per_h * result.step_h)
 
 
+LIQUID_COSTS = (junction_headroom, throttled_work, dew_point)
+"""Costs of liquid-cooled racks."""
 COSTS: dict[str, CostFunction] = {
     function.__name__: function
     for function in (
         hot_inlets,
         hottest_inlet,
         throttled_racks,
+        *LIQUID_COSTS,
         overdue_work,
         grid_overload,
         fleet_power,
@@ -123,6 +142,14 @@ class Costs:
             if name in self._functions:
                 raise ConfigError(f"costs: {name!r} is named twice")
             self._functions[name], self._weights[name] = function, _checked_weight(name, weight)
+        for function in LIQUID_COSTS:
+            name = function.__name__
+            if self._functions.get(name) is function and any(
+                c.liquid is None for c in fleet.configs
+            ):
+                raise ConfigError(
+                    f"costs: {name} needs liquid-cooled racks; valid with section liquid"
+                )
         unprotected = all(c.protection.ashrae_class is None for c in fleet.configs)
         if self._functions.get("throttled_racks") is throttled_racks and unprotected:
             raise ConfigError(

@@ -19,7 +19,7 @@ from sdc_taichi.sim.drivers import Drivers, InputReader
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.snapshot import as_array
-from sdc_taichi.sim.step_inputs import MOST_MOVES
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS, MOST_MOVES
 from sdc_taichi.types import F64, I64, State
 
 Seed = int | Sequence[int | None] | I64 | None
@@ -212,6 +212,7 @@ COMMAND_LIMITS = {
     "battery": (-1.0, 1.0),
     "chilled_water": (FREEZING_C, BOILING_C),
     "transfer": (0.0, 1.0),
+    **{name: limits for name, (_, limits) in LIQUID_COMMANDS.items()},
 }
 """Minimum and maximum of each command of an agent or a controller, by field of ``Actions``."""
 
@@ -328,15 +329,17 @@ def _generator(state: Any) -> np.random.Generator:
 def _checked_commands(
     saved: Mapping[str, Any] | None, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
 ) -> dict[str, F64] | None:
-    """Check the saved commands of the last step, (), (B,), (U,) or (R,) each.
+    """Check the saved commands of the last step, (), (B,), (U,), (C,) or (R,) each.
 
     None stands for a state before the first step. A controller may leave the commands ``cooling``,
-    ``placement`` and ``chilled_water`` at None; the saved state then lacks them.
+    ``placement``, ``chilled_water`` and those of liquid cooling at None; the saved state then lacks
+    them.
     """
     if saved is None:
         return None
     names = [*learned, *by_others]
-    optional = {"cooling", "placement", "chilled_water", "transfer"}.intersection(by_others)
+    optional = {"cooling", "placement", "chilled_water", "transfer", *LIQUID_COMMANDS}
+    optional = optional.intersection(by_others)
     if not set(names) - optional <= set(saved) <= set(names):
         raise SdcError(
             f"state: actions are {shortened(sorted(saved))}; valid is a dict of {sorted(names)}"
@@ -345,6 +348,8 @@ def _checked_commands(
         "cooling": (fleet.units,),
         "fan": (fleet.units,),
         "placement": (fleet.racks,),
+        "cdu_setpoint_c": (fleet.cdus,),
+        "cdu_flow": (fleet.cdus,),
         "transfer": (fleet.size, fleet.sites_per_fleet),
     }
     return {

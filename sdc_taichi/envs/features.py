@@ -29,7 +29,7 @@ from sdc_taichi.envs.site_order import cleaner_first
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
-from sdc_taichi.types import CRAC_UNITS, F32, F64
+from sdc_taichi.types import CDUS, CRAC_UNITS, F32, F64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 """Default leads of the forecasts of carbon intensity and price, in h."""
@@ -91,6 +91,8 @@ class Layout:
     """Number of racks on which agents place work; 0 if agents do not place work."""
     hall: int = 0
     """1 if agents ``crac`` or ``plant`` learn, else 0."""
+    liquid: int = 0
+    """1 if racks are liquid-cooled, else 0."""
     neighbours: int = 0
     """Number of neighbouring CRAC units that an agent ``crac`` observes."""
     other_sites: int = 0
@@ -186,7 +188,8 @@ _TIME: _Kind = {}
 _MEASURED: _Kind = {}
 _OF_VIEW: _Kind = {}
 _OF_UNITS: _Kind = {}
-_OF_AXIS = {CRAC_UNITS: _OF_UNITS}
+_OF_CDUS: _Kind = {}
+_OF_AXIS = {CRAC_UNITS: _OF_UNITS, CDUS: _OF_CDUS}
 """Features of units by kind of unit."""
 
 
@@ -244,7 +247,7 @@ def unit_features(layout: Layout, axis: str) -> tuple[Feature, ...]:
 
     Args:
         layout: numbers of entries.
-        axis: kind of units: ``CRAC_UNITS``.
+        axis: kind of units: ``CRAC_UNITS`` or ``CDUS``.
     """
     return _features_of(_OF_AXIS[axis], layout)
 
@@ -533,6 +536,119 @@ def neighbours(view: View) -> F64:
     return pairs.reshape(-1, pairs.shape[-1])
 
 
+def _of_liquid(layout: Layout) -> int:
+    return layout.liquid
+
+
+@_feature(_OF_VIEW, "C", 5.0, 60.0, _of_liquid)
+def facility_supply(view: View) -> F64:
+    """Temperature of the facility water to the CDUs in the last step."""
+    return _of_loop(view, "facility_supply_c")
+
+
+@_feature(_OF_VIEW, "C", 5.0, 80.0, _of_liquid)
+def facility_return(view: View) -> F64:
+    """Temperature of the facility water from the CDUs in the last step."""
+    return _of_loop(view, "facility_return_c")
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, _of_liquid)
+def trim_load(view: View) -> F64:
+    """Heat that the trim chiller removed in the last step, divided by its capacity."""
+    capacity_w = view.fleet.values("liquid.facility.trim_kw") * 1e3
+    return _of_loop(view, "trim_load_w") / np.maximum(capacity_w, 1.0)
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, _of_liquid)
+def heat_delivered(view: View) -> F64:
+    """Heat delivered for reuse in the last step, divided by the IT power at the design point."""
+    return _of_loop(view, "reuse_w") / view.sizing.it_w
+
+
+@_feature(_OF_VIEW, "share", 0.0, 1.0, _of_liquid)
+def heat_demand(view: View) -> F64:
+    """Most heat that is taken for reuse, divided by the IT power at the design point."""
+    reuse = [config.liquid.reuse for config in view.fleet.configs if config.liquid is not None]
+    demand_w = [
+        0.0 if x.kind == "none" else np.inf if x.demand_kw is None else x.demand_kw * 1e3
+        for x in reuse
+    ]
+    return np.array(demand_w)[None] / view.sizing.it_w
+
+
+@_feature(_OF_VIEW, "currency/kWh", -0.2, 0.2, _of_liquid)
+def heat_price(view: View) -> F64:
+    """Price of delivered heat."""
+    return view.fleet.values("liquid.reuse.price_per_kwh_heat")[None]
+
+
+@_feature(_OF_VIEW, "K", 0.0, 50.0, _of_liquid)
+def junction_headroom(view: View) -> F64:
+    """Smallest difference of the throttling limit and the junction temperature of GPUs."""
+    return view.junction_headroom_k[None]
+
+
+def _of_loop(view: View, name: str) -> F64:
+    """Return a quantity of the last step, (1, B).
+
+    Before the first step temperatures equal the setpoint of the first CDU; other quantities are 0.
+    """
+    if view.last is not None:
+        return np.asarray(getattr(view.last, name)[None])
+    if name.endswith("_c"):
+        return view.state.cdu_setpoint_c[view.fleet.cdu_offsets[:-1]][None]
+    return np.zeros((1, view.size))
+
+
+@_feature(_OF_CDUS, "C", 20.0, 45.0)
+def cdu_setpoint(view: View) -> F64:
+    """Supply setpoint of the own CDU."""
+    return view.state.cdu_setpoint_c[None]
+
+
+@_feature(_OF_CDUS, "C", 15.0, 70.0)
+def cdu_supply(view: View) -> F64:
+    """Temperature of the coolant to the racks from the own CDU in the last step."""
+    supply_c = view.state.cdu_setpoint_c if view.last is None else view.last.cdu_supply_each_c
+    return supply_c[None]
+
+
+@_feature(_OF_CDUS, "C", 15.0, 90.0)
+def cdu_return(view: View) -> F64:
+    """Temperature of the coolant from the racks to the own CDU in the last step."""
+    return view.cdu_return_c[None]
+
+
+@_feature(_OF_CDUS, "share", 0.0, 1.2)
+def cdu_flow(view: View) -> F64:
+    """Commanded flow of the own CDU, relative to its design flow."""
+    return view.state.cdu_flow[None]
+
+
+@_feature(_OF_CDUS, "share", 0.0, 1.2)
+def cdu_valve(view: View) -> F64:
+    """Facility water through the own CDU in the last step, relative to its design flow."""
+    return (view.state.cdu_flow * 0.0 if view.last is None else view.last.cdu_valve)[None]
+
+
+@_feature(_OF_CDUS, "share", 0.0, 1.0)
+def cdu_running(view: View) -> F64:
+    """1 if coolant flowed through the own CDU in the last step, else 0."""
+    return view.cdu_running[None]
+
+
+@_feature(_OF_CDUS, "C", 20.0, 110.0)
+def cdu_junction(view: View) -> F64:
+    """Hottest GPU junction of the racks that the own CDU serves, in the last step."""
+    return view.cdu_junction_c[None]
+
+
+@_feature(_OF_CDUS, "K", 0.0, 50.0)
+def cdu_headroom(view: View) -> F64:
+    """Smallest difference of the throttling limit and the junction temperature of these racks."""
+    return view.cdu_headroom_k[None]
+
+
 SITE_LEADS_H = (6.0, 24.0)
 """Leads of the forecast of the carbon intensity of other sites, in h."""
 
@@ -705,8 +821,8 @@ def features_markdown() -> str:
 
 
 def group_features_markdown() -> str:
-    """Return the Markdown table of the features of ``crac``, ``plant`` and ``agent_geo``."""
-    layout = Layout(hall=1, neighbours=1, other_sites=1)
+    """Return the Markdown table of the features of all groups but those of ``AGENTS``."""
+    layout = Layout(hall=1, liquid=1, neighbours=1, other_sites=1)
     of_view = [*view_features(layout), *(f for x in _OF_AXIS for f in unit_features(layout, x))]
     return _markdown(of_view, {name: name for name in ALL_AGENTS[len(AGENTS) :]})
 

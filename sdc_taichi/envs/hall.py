@@ -1,8 +1,9 @@
-"""Environments with an agent for each CRAC unit of a hall and one for the plant."""
+"""Environments whose agents control the air or the liquid cooling of a hall."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
 
@@ -17,6 +18,11 @@ from sdc_taichi.sim.hall_family import hall_family
 
 HALL_OPTIONS: dict[str, Any] = {"agents": HALL_AGENTS, "actions": "continuous", "days": 1}
 """Options of environments of a hall that differ from those of data centers."""
+LIQUID_OPTIONS: dict[str, Any] = HALL_OPTIONS | {
+    "agents": ("plant", "cdu", "power_cap"),
+    "commands": {"plant": ("facility_approach_k", "reuse_share")},
+}
+"""Options of environments of a hall with liquid-cooled racks."""
 LARGEST_CHANGES = {"fan": ("fan_change", 0.1), "cooling": ("setpoint_change_k", 0.5)}
 """Option and its value that sets the largest change in a step of 5 minutes, by command."""
 
@@ -70,23 +76,30 @@ def hall_env(*, num_envs: int, **arguments: Any) -> MultiAgentVectorEnv: ...
 def hall_env(
     config: ConfigSource = "hall_agents_6", num_envs: int | None = None, **arguments: Any
 ) -> SdcParallelEnv | MultiAgentVectorEnv:
-    """Create an environment whose agents control the fans and the plant of a hall.
+    """Create an environment whose agents control the cooling of a hall.
+
+    They are ``crac`` and ``plant``, and in a hall with liquid-cooled racks ``cdu``, ``plant`` and
+    ``power_cap``.
 
     Args:
         config: a preset, a file or a config of a hall, or a ``HallFamily``; with ``num_envs`` also
-            several configs. The fans of the CRAC units must be controlled
+            several configs. Agents ``crac`` need controlled fans of the CRAC units
             (``hvac.crac.flow_model``).
         num_envs: number of halls in a batch of arrays; None creates a PettingZoo environment of one
             hall.
         arguments: arguments of ``parallel_env`` or ``vector_env``, which take precedence over
-            ``HALL_OPTIONS`` and ``LARGEST_CHANGES``.
+            ``HALL_OPTIONS`` or ``LIQUID_OPTIONS``, and ``LARGEST_CHANGES``.
 
     Raises:
         SdcError: a config or option is not valid.
     """
     options = arguments.pop("options", None)
     chosen = {} if options is None else fields_set(options)
-    arguments = HALL_OPTIONS | chosen | arguments
+    given = chosen | arguments
+    defaults = LIQUID_OPTIONS if _has_liquid(config) else HALL_OPTIONS
+    if "plant" not in given.get("agents", ("plant",)):
+        defaults = {name: value for name, value in defaults.items() if name != "commands"}
+    arguments = defaults | given
     if arguments["actions"] == "continuous":
         decided = _decided(arguments["agents"], arguments.get("commands") or {})
         for option, value in (LARGEST_CHANGES[x] for x in LARGEST_CHANGES if x in decided):
@@ -96,8 +109,20 @@ def hall_env(
     return MultiAgentVectorEnv(num_envs, config, **arguments)
 
 
+def _has_liquid(config: Any) -> bool:
+    """Return True if the first of several configs has liquid-cooled racks."""
+    one = config
+    if isinstance(config, Sequence) and not isinstance(config, str) and config:
+        one = config[0]
+    if isinstance(one, str | os.PathLike):
+        one = load_config(one)
+    return (
+        one.get("liquid") if isinstance(one, Mapping) else getattr(one, "liquid", None)
+    ) is not None
+
+
 def _decided(agents: Iterable[str], commands: Mapping[str, Iterable[str]]) -> set[str]:
     """Return the commands that agents decide; unknown agents are reported elsewhere."""
     known = [agent for agent in agents if agent in AGENT_DEFINITIONS]
-    default = {agent: AGENT_DEFINITIONS[agent].commands[:1] for agent in known}
+    default = {agent: AGENT_DEFINITIONS[agent].default_commands for agent in known}
     return {name for agent in known for name in commands.get(agent, default[agent])}

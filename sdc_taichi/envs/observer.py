@@ -102,6 +102,7 @@ class Observer:
             fans=count if "fan" in decided else 0,
             racks=int(fleet.rack_offsets[1]) if "placement" in decided else 0,
             hall=int(not set(agents).isdisjoint(HALL_AGENTS)),
+            liquid=int(all(config.liquid is not None for config in fleet.configs)),
             neighbours=neighbours,
             other_sites=fleet.sites_per_fleet - 1 if "agent_geo" in agents else 0,
         )

@@ -37,6 +37,7 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 from sdc_taichi.types import I64
 
 
@@ -81,8 +82,10 @@ class EnvOptions(BaseModel):
     commands: Mapping[str, tuple[str, ...]] | None = None
     """Commands that agents decide, by agent, in the order of the numbers in the action. agent_ls
     can decide ``load`` and ``placement``; agent_dc ``cooling``, ``fan`` and ``placement``;
-    agent_bat ``battery``; agent_geo ``transfer``; crac ``fan`` and ``cooling``; plant ``cooling``
-    and ``chilled_water``. Agents that are left out decide the first of these."""
+    agent_bat ``battery``; agent_geo ``transfer``; crac ``fan`` and ``cooling``; plant ``cooling``,
+    ``chilled_water``, ``facility_approach_k`` and ``reuse_share``; cdu ``cdu_setpoint_c`` and
+    ``cdu_flow``; power_cap ``power_cap``. A cdu that is left out decides both of its commands, and
+    other agents decide the first of theirs."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Change of the setpoint in one step at a continuous action of 1, in K. This is the largest
     change."""
@@ -232,7 +235,7 @@ class EnvOptions(BaseModel):
             (("months",), self.start == "fixed", "with start fixed; valid with start sampled"),
             (
                 ("others",),
-                set(self.agents) >= set(AGENTS) and not self._others_transfer(),
+                set(self.agents) >= set(AGENTS) and not self._others_beyond(),
                 "as all agents learn; valid with fewer",
             ),
             (("action_order",), continuous, "with actions continuous; valid with discrete"),
@@ -273,15 +276,17 @@ class EnvOptions(BaseModel):
             ),
         ]
 
-    def _others_transfer(self) -> bool:
-        """True if the controller ``others`` moves work between the sites of a fleet."""
+    def _others_beyond(self) -> bool:
+        """True if ``others`` moves work between sites, or controls liquid-cooled racks."""
         if isinstance(self.others, str):
-            return any(part.strip().startswith("geo") for part in self.others.split(","))
-        return "transfer" in commands_of(self.others)
+            return any(
+                part.strip().startswith(("geo", "liquid")) for part in self.others.split(",")
+            )
+        return not {"transfer", *LIQUID_COMMANDS}.isdisjoint(commands_of(self.others))
 
     def commands_of(self, agent: str) -> tuple[str, ...]:
         """Return the commands that an agent decides if it learns, in the order of its action."""
-        return (self.commands or {}).get(agent, (AGENT_DEFINITIONS[agent].command,))
+        return (self.commands or {}).get(agent, AGENT_DEFINITIONS[agent].default_commands)
 
     def start_days(self) -> list[int]:
         """Return the days of the year, from 0, on which a sampled episode may start.

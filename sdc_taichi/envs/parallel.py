@@ -154,7 +154,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
     def _infos(self, infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the infos of each agent.
 
-        Agents of CRAC units and of transfers have ``acts`` in addition, those of units also
+        Agents of units and of transfers have ``acts`` in addition, those of CRAC units also
         ``zone_heat_k_h``.
         """
         masks, heat_k_h = self.core.masks(), self.core.zone_heat_k_h()

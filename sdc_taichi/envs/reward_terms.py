@@ -6,7 +6,7 @@ site and hall. ``sla`` is a share of the work of a full step. The other terms ha
 a ratio, ``hot_inlets`` is in K, ``queue`` is in tens of tasks, ``dropped`` is in tasks, and
 ``demand_charge`` has the unit of ``cost``. ``demand_charge`` differs from 0 only in the few steps
 that raise the highest power. No term is scaled by data of the run. All terms are at most 0, except
-the terms of single agents.
+``heat_sales`` and the terms of single agents.
 
 **Terms of single agents.** Carbon emissions depend more on demand and weather than on any action.
 The terms ``work_carbon``, ``cooling_carbon`` and ``battery_carbon`` therefore split the carbon of a
@@ -290,6 +290,18 @@ def dropped(r: StepResult, c: TermContext) -> F64:
 def sla(r: StepResult, c: TermContext) -> F64:
     """Work past its deadline, dropped or lost, divided by the work of a step at full load."""
     return -(r.overdue_tasks + r.dropped_tasks + r.lost_tasks) / TASKS_PER_STEP
+
+
+@reward_term
+def throttled_work(r: StepResult, c: TermContext) -> F64:
+    """Work that hot or capped GPUs delay, divided by the work of a step at full load."""
+    return -r.throttled_tasks / TASKS_PER_STEP
+
+
+@reward_term
+def heat_sales(r: StepResult, c: TermContext) -> F64:
+    """Cost of delivered heat: minus its income, in units of `cost`."""
+    return r.heat_income / (PRICE_PER_KWH * c.design_kwh)
 
 
 @reward_term

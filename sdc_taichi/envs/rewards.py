@@ -19,6 +19,8 @@ from sdc_taichi.envs.agents import (
     AGENTS,
     ALL_AGENTS,
     HALL_AGENTS,
+    LIQUID_AGENTS,
+    TEAM_OF_LIQUID,
     present_agents,
 )
 from sdc_taichi.envs.released import ReleasedRewards
@@ -89,6 +91,7 @@ class Rewards:
         collaboration: weight of an agent's individual reward in the reward that it receives, 0..1.
         agents: names of the agents that learn.
         days: length of an episode, in days.
+        liquid: True if an agent controls liquid cooling.
 
     Attributes:
         identity: plain values that identify the rewards: the scales, or the path of a function.
@@ -106,6 +109,7 @@ class Rewards:
         *,
         agents: Sequence[str],
         days: float,
+        liquid: bool = False,
     ) -> None:
         self._collaboration, self._agents = collaboration, tuple(agents)
         self._team = team_of(agents)
@@ -117,9 +121,9 @@ class Rewards:
         if isinstance(rewards, str) and rewards == "sustaindc":
             self._released = ReleasedRewards()
         elif isinstance(rewards, Mapping):
-            self._scales = self.identity = _checked_scales(rewards, self._team)
+            self._scales = self.identity = _checked_scales(rewards, self._team, liquid)
         elif isinstance(rewards, str) and rewards in SCALED_SETS:
-            self._scales = self.identity = {a: _scales_of(a, rewards) for a in self._team}
+            self._scales = self.identity = {a: _scales_of(a, rewards, liquid) for a in self._team}
             if rewards in _COUNTED_ONCE and len(self._agents) > 1:
                 for agent in self._agents:
                     # The terms of units are parts of those of the plant.
@@ -327,14 +331,15 @@ def team_of(agents: Sequence[str]) -> tuple[str, ...]:
     """Return the groups whose individual rewards the collaborative rewards combine, in order.
 
     They are the groups that learn, and the agents of the released code that exist beside them. If
-    only agents of the cooling of a hall learn, they are these.
+    only agents of the cooling of a hall learn, they are these; of liquid cooling those that learn.
 
     Args:
         agents: names of the groups that learn.
     """
-    hall = set(HALL_AGENTS) if not set(HALL_AGENTS).isdisjoint(agents) else set[str]()
+    learning, liquid = set(agents), not set(LIQUID_AGENTS).isdisjoint(agents)
+    hall = set[str]() if liquid or learning.isdisjoint(HALL_AGENTS) else set(HALL_AGENTS)
     others = set(AGENTS) & set(present_agents(agents))
-    if hall and hall >= set(agents):
+    if learning <= {*HALL_AGENTS, *LIQUID_AGENTS}:
         others = set()
     return tuple(agent for agent in ALL_AGENTS if agent in {*agents, *hall, *others})
 
@@ -362,16 +367,23 @@ def _peak_kw(before_kw: F64, result: StepResult) -> F64:
     return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
-def _scales_of(agent: str, rewards: str) -> dict[str, float]:
+def _scales_of(agent: str, rewards: str, liquid: bool) -> dict[str, float]:
     """Return the scales of an agent in a reward set.
 
     In reward set ``own`` agents without scales of their own have those of ``default``, which
     already are their own parts.
 
+    Args:
+        agent: name of the group.
+        rewards: name of the reward set.
+        liquid: True if an agent controls liquid cooling.
+
     Raises:
         ConfigError: the agent has no scales in this set.
     """
     scales = AGENT_DEFINITIONS[agent].scales
+    if liquid and agent in HALL_AGENTS:
+        scales = TEAM_OF_LIQUID
     if rewards == "own" and rewards not in scales:
         return scales["default"]
     if rewards not in scales:
@@ -380,7 +392,7 @@ def _scales_of(agent: str, rewards: str) -> dict[str, float]:
 
 
 def _checked_scales(
-    by_agent: Mapping[str, Mapping[str, float]], team: Sequence[str]
+    by_agent: Mapping[str, Mapping[str, float]], team: Sequence[str], liquid: bool
 ) -> dict[str, dict[str, float]]:
     """Check a user's scales; agents without an entry receive those of reward set ``default``."""
     for agent, scales in by_agent.items():
@@ -402,7 +414,7 @@ def _checked_scales(
                     f"-{MOST_SCALE:g}..{MOST_SCALE:g}"
                 )
     return {
-        agent: dict(by_agent.get(agent, AGENT_DEFINITIONS[agent].scales["default"]))
+        agent: dict(by_agent[agent] if agent in by_agent else _scales_of(agent, "default", liquid))
         for agent in team
     }
 

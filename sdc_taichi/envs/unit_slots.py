@@ -11,7 +11,7 @@ import numpy.typing as npt
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import CRAC_UNITS, F64, I32
+from sdc_taichi.types import CDUS, CRAC_UNITS, F64, I32
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -25,7 +25,7 @@ class UnitSlots:
     Args:
         fleet: the B data centers.
         width: number of slots, W; None means as few as possible.
-        axis: kind of the units: ``CRAC_UNITS``.
+        axis: kind of the units: ``CRAC_UNITS`` or ``CDUS``.
 
     Raises:
         ConfigError: a data center has more units than slots.
@@ -39,7 +39,7 @@ class UnitSlots:
     """
 
     def __init__(self, fleet: Fleet, width: int | None = None, axis: str = CRAC_UNITS) -> None:
-        self._offsets: I32 = {CRAC_UNITS: fleet.unit_offsets}[axis]
+        self._offsets: I32 = {CRAC_UNITS: fleet.unit_offsets, CDUS: fleet.cdu_offsets}[axis]
         self.counts = np.diff(self._offsets).astype(np.int64)
         most = int(self.counts.max())
         if width is not None and most > width:

@@ -30,6 +30,8 @@ from sdc_taichi.types import F64, I64, StepResult
 
 UTILISATIONS = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 1.0])
 """Utilisations at which the power of ``follow`` is computed; values between are interpolated."""
+LEAST_HEADROOM_K = 5.0
+"""Junction headroom below which rewards and costs charge each kelvin, in K."""
 HIGHEST_RECOMMENDED_C = RECOMMENDED_C[1]
 """Highest inlet temperature that ASHRAE TC 9.9 recommends, in C."""
 
@@ -118,6 +120,11 @@ def zone_heat(r: StepResult, v: View, c: ViewContext) -> F64:
     return -np.maximum(v.zone_hottest_true_c - HIGHEST_RECOMMENDED_C, 0.0)
 
 
+def hot_junctions(r: StepResult, v: View, c: ViewContext) -> F64:
+    """Lack of headroom of the hottest GPU junction below 5 K under its throttling limit, in K."""
+    return -np.maximum(LEAST_HEADROOM_K - v.junction_headroom_k, 0.0)
+
+
 def geo_carbon(r: StepResult, v: View, c: ViewContext) -> F64:
     """Carbon of the sent work at the receivers with the transfer, less that at the sender."""
     added_g = _of_sent_work(r, v, c, r.ci_g_per_kwh, c.terms.coming_ci)
@@ -159,7 +166,7 @@ def _per_sum(of_dc: F64, per_unit: F64, view: View) -> F64:
 
 
 OF_DATA_CENTERS: dict[str, ViewTerm] = {
-    f.__name__: f for f in (hall_power, hall_heat, geo_carbon, geo_cost)
+    f.__name__: f for f in (hall_power, hall_heat, hot_junctions, geo_carbon, geo_cost)
 }
 """Terms of the agents of a data center, by name."""
 OF_UNITS: dict[str, ViewTerm] = {f.__name__: f for f in (zone_power, zone_heat)}

@@ -25,6 +25,10 @@ from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import EnvOptions, make_options
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import CDUS, CRAC_UNITS
+
+_NUMBER_OF_AXIS = {CRAC_UNITS: "crac_units", CDUS: "cdus"}
+"""Field of ``Interface`` with the number of units of each kind in a data center."""
 
 
 class ObservedFeature(Section):
@@ -79,6 +83,8 @@ class Interface(Section):
     """Groups whose agents do not share a policy, so that the number of CRAC units is fixed."""
     sites: int | None = Field(default=None, ge=2)
     """Number of sites of a fleet among which an agent moves work; None if no agent moves work."""
+    cdus: int | None = Field(default=None, ge=1)
+    """Number of CDUs of a data center whose agents do not share a policy; None if they do."""
     neighbours: int | None = Field(default=None, ge=0, le=8)
     """Number of neighbouring CRAC units that an agent ``crac`` observes; None without such
     agents."""
@@ -91,13 +97,18 @@ class Interface(Section):
         of_units = [agent for agent in self.agents if AGENT_DEFINITIONS[agent].per_unit]
         if not set(self.own_policies) <= set(of_units):
             raise ValueError(f"own_policies {list(self.own_policies)}; valid are {of_units}")
-        if self.own_policies and self.crac_units is None:
-            raise ValueError("crac_units: None; valid with own_policies is their number")
+        for group in self.own_policies:
+            name = _NUMBER_OF_AXIS[AGENT_DEFINITIONS[group].axis]
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: None; valid with own_policies is their number")
         return self
 
     def policies_of(self, group: str) -> tuple[str, ...]:
         """Return what the networks act for: the group, or each of its agents."""
-        return members_of(group, self.crac_units or 0) if group in self.own_policies else (group,)
+        if group not in self.own_policies:
+            return (group,)
+        count: int = getattr(self, _NUMBER_OF_AXIS[AGENT_DEFINITIONS[group].axis])
+        return members_of(group, count)
 
     def width(self, agent: str) -> int:
         """Return the number n of entries of the observation of an agent, or of one of a group."""
@@ -184,6 +195,7 @@ _LABELS = {
     "crac_units": "CRAC units (hvac.crac.units)",
     "racks": "racks",
     "sites": "sites",
+    "cdus": "CDUs",
 }
 """Name of each field of ``Interface`` in messages, in the order of comparison."""
 
@@ -213,7 +225,8 @@ def interface_of(
     continuous, named = options.actions == "continuous", options.observations == "default"
     has_order = not continuous and "battery" in names
     of_dc = set(decided.get("agent_dc", ()))
-    on_units = bool(own_policies) or not of_dc.isdisjoint(("cooling", "fan"))
+    own_axes = {AGENT_DEFINITIONS[group].axis for group in own_policies}
+    on_units = CRAC_UNITS in own_axes or not of_dc.isdisjoint(("cooling", "fan"))
     on_racks = "placement" in names
     return Interface(
         agents=options.agents,
@@ -231,6 +244,7 @@ def interface_of(
         racks=equal_number(fleet.rack_offsets, "racks") if on_racks else None,
         own_policies=tuple(own_policies),
         sites=fleet.sites_per_fleet if "transfer" in names else None,
+        cdus=equal_number(fleet.cdu_offsets, "CDUs") if CDUS in own_axes else None,
         neighbours=options.neighbours if "crac" in options.agents else None,
     )
 

@@ -497,4 +497,6 @@ def _reasons(config: DataCenterConfig) -> list[str]:
         reasons.append(_PLACEMENT[config.workload.placement])
     if config.hvac.crac.flow_model == "controlled":
         reasons.append("actions move the fans (flow model controlled)")
+    if config.liquid is not None:
+        reasons.append("actions move coolant loops (section liquid), which plans hold")
     return reasons

@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.hall.protection import TRIPPED
-from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult, LiquidState
-from sdc_taichi.sim.sizing import sites_pressure_pa
+from sdc_taichi.sim.room_dew_point import RoomDewPoint
 from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.work_allocation import Placement
 from sdc_taichi.types import (
@@ -100,11 +99,7 @@ class LiquidHalls:
         self._cdu_manifold = fleet.liquid.cdu_manifold
         self._manifolds = len(fleet.liquid.rack_offsets) - 1
         sections = [config.liquid for config in fleet.configs]
-        self._dew_point_c = np.array(
-            [0.0 if s is None else s.dew_point_c for s in sections], dtype=np.float64
-        )
-        self._is_humid = np.isnan(self._dew_point_c)
-        self._pressure_pa = sites_pressure_pa(fleet) if self._is_humid.any() else None
+        self._dew_point = RoomDewPoint(fleet)
         self._pump_share = np.array(
             [s.cdus.pump_share if s.cdus.pumps > 1 else 0.0 for s in sections if s is not None]
         ).repeat(np.diff(fleet.cdu_offsets)[[s is not None for s in sections]])
@@ -124,7 +119,7 @@ class LiquidHalls:
                 powered=np.ones(len(self._racks)),
                 outdoor_c=outdoor_c,
                 wet_bulb_c=wet_bulb_c,
-                dew_point_c=self._room_dew_point_c(outdoor_c, wet_bulb_c),
+                dew_point_c=self._dew_point.at(outdoor_c, wet_bulb_c),
             )
         )
         return self._kept(state)
@@ -158,7 +153,7 @@ class LiquidHalls:
                 powered=powered,
                 outdoor_c=surroundings.outdoor_c,
                 wet_bulb_c=surroundings.wet_bulb_c,
-                dew_point_c=self._room_dew_point_c(surroundings.outdoor_c, surroundings.wet_bulb_c),
+                dew_point_c=self._dew_point.at(surroundings.outdoor_c, surroundings.wet_bulb_c),
                 cdu_setpoint_c=commands.cdu_setpoint_target_c,
                 cdu_flow=commands.cdu_flow_command,
                 facility_approach_k=commands.facility_approach_k,
@@ -271,13 +266,6 @@ class LiquidHalls:
             busy = self._fleet.group_sums(self._fleet.per_group_servers() * placement.group_load)
             return (busy / self._servers)[self._racks]
         return placement.utilisation[self._dc]
-
-    def _room_dew_point_c(self, outdoor_c: F64, wet_bulb_c: F64) -> F64:
-        """Return the dew point of each room, in C, (B,)."""
-        if self._pressure_pa is None:
-            return self._dew_point_c
-        outdoor_dew_c = moist_air.dew_point_c(outdoor_c, wet_bulb_c, self._pressure_pa)
-        return np.where(self._is_humid, outdoor_dew_c, self._dew_point_c)
 
     def _failures(self, surroundings: Surroundings) -> dict[str, Any]:
         """Return the failures as arguments of ``LiquidInputs``."""
