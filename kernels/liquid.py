@@ -375,7 +375,7 @@ def _rack_at_rest(liquid: ti.template(), dc, r, supply_c):
         base_w = idle_w + rack.gpu_span_w * u
         leak_w_per_k = rack.leak_per_k * base_w
         rest = ti.max(1.0 - leak_w_per_k * resistance, liquid.real(0.05))
-        free_w = (base_w + leak_w_per_k * (supply_c - rack.leak_ref_c)) / rest
+        free_w = ti.max(base_w + leak_w_per_k * (supply_c - rack.leak_ref_c), 0.0) / rest
         most_w = ti.max((rack.throttle_c - supply_c) / resistance, idle_w)
         if free_w > most_w and liquid.dcs[dc].throttle_s < 0.0:
             liquid.dcs[dc].throttle_s = 0.0
@@ -870,7 +870,8 @@ def _advance_rack(liquid: ti.template(), dc, r, supply_c, dt, part, time_s):
         gpus_w = liquid.real(0.0)
         if powered > 0.0:
             base_w = idle_w + rack.gpu_span_w * u
-            free_w = base_w * (1.0 + rack.leak_per_k * (before_c - rack.leak_ref_c))
+            leakage = ti.max(1.0 + rack.leak_per_k * (before_c - rack.leak_ref_c), 0.0)
+            free_w = base_w * leakage
             at_limit_w = to_coolant_w + (rack.throttle_c - before_c) / rack.k_per_w
             most_w = ti.max(at_limit_w / (capture * powered * rack.gpus), idle_w)
             if free_w > most_w and of_dc.throttle_s < 0.0:

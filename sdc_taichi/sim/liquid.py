@@ -55,6 +55,13 @@ LEAST_FLOW = 0.5
 failures."""
 
 
+MOST_FLOW = 1.1
+"""Largest flow of coolant, as a share of design."""
+LEAST_CAPTURE, LEAST_K_PER_W, LEAST_LOSS_W_PER_K = 1e-3, 1e-6, 1.0
+"""Lower bounds of the share of the heat of chips in the coolant, of their resistance in K/W, and of
+the losses of the pipes of a rack in W/K, so that every heat flow has a temperature."""
+
+
 class LiquidCarry(Protocol):
     """State of coolant loops between steps, as in ``LiquidState``."""
 
@@ -237,7 +244,7 @@ class Liquid:
         self._cooler_approach_k = self._per_dc(plants.approach_k)
         self._size_towers()
         self._design_m3s = np.bincount(fleet.rack_manifold, self.sizing.rack_m3s, loops)
-        self._usual_substeps = np.ceil(step_s / self._per_dc(plants.substep_s))
+        self._usual_substeps = np.ceil(step_s / np.minimum(plants.substep_s, self._turnover_s()))
         self._initial = LiquidState(
             cdu_setpoint_c=np.broadcast_to(cdus.setpoint_c, self._cdus).astype(np.float64),
             cdu_flow=np.broadcast_to(cdus.flow, self._cdus).astype(np.float64),
@@ -542,6 +549,27 @@ class Liquid:
         first = self.fleet.cdu_offsets[self.fleet.manifold_offsets[:-1]]
         return of_cdus_k[np.minimum(first, self._cdus - 1)].astype(np.float64)
 
+    def _turnover_s(self) -> F64:
+        """Return the time in which the smallest loop of each data center turns over, in s, (B,).
+
+        Longer substeps would make the explicit parts of a step unstable. Rear doors, whose heat
+        falls with the temperature of the coolant, count as flow.
+        """
+        racks, sizes, loops = self.fleet.racks, self.sizing, self._loops
+        dc = self.fleet.manifold_dc
+        plants = self.fleet.plants
+        j_per_m3_k = self._per_dc(plants.density_kg_m3 * plants.heat_capacity_j_per_kg_k)
+        doors = racks.door_effectiveness * racks.other_max_w / racks.door_rise_k
+        of_doors = np.broadcast_to(doors, self._racks)
+        rate = MOST_FLOW * self._design_m3s * j_per_m3_k[dc]
+        rate += np.bincount(self.fleet.rack_manifold, of_doors, loops)
+        least_s = np.full(self._size, np.inf)
+        np.minimum.at(least_s, dc, sizes.loop_j_per_k / rate)
+        most_valve = np.broadcast_to(self.fleet.cdus.max_valve, self._cdus).max()
+        water = most_valve * np.maximum(sizes.water_w_per_k, 1e-9)
+        water_s = np.where(sizes.water_w_per_k > 0.0, sizes.water_j_per_k / water, np.inf)
+        return np.asarray(np.minimum(least_s, water_s))
+
     def _size_towers(self) -> None:
         """Size towers; the water of a tower has the capacity rate of the facility water."""
         self._has_towers = bool(self._is_tower.any())
@@ -572,18 +600,17 @@ class Liquid:
             "cpus_span_w": p.cpus * np.subtract(p.cpu_max_w, p.cpu_idle_w),
             "other_idle_w": p.other_idle_w,
             "other_span_w": np.subtract(p.other_max_w, p.other_idle_w),
-            "capture_chip": p.capture_chip,
+            "capture_chip": np.maximum(p.capture_chip, LEAST_CAPTURE),
             "capture_other": p.capture_other,
             "leak_per_k": p.leak_per_k,
             "leak_ref_c": p.leak_ref_c,
-            "r_fixed_k_per_w": np.add(p.r_jc_k_per_w, p.r0_k_per_w),
+            "r_fixed_k_per_w": np.maximum(np.add(p.r_jc_k_per_w, p.r0_k_per_w), LEAST_K_PER_W),
             "r_film_k_m3s_per_w": p.a_k_lpm_per_w * M3S_PER_LPM * gpus / p.chip_flow_share,
             "throttle_c": p.throttle_c,
             "trip_c": p.trip_c,
             "trip_flow": p.trip_flow_share,
             "design_m3s": self.sizing.rack_m3s,
-            # Some heat leaves coolant that nothing else cools.
-            "loss_w_per_k": np.maximum(p.loss_w_per_k, 1.0),
+            "loss_w_per_k": np.maximum(p.loss_w_per_k, LEAST_LOSS_W_PER_K),
             "chips_j_per_k": gpus * p.chip_j_per_k,
             "stagnant_w_per_k": gpus * p.stagnant_w_per_k,
             "door_effectiveness": p.door_effectiveness,
