@@ -436,6 +436,10 @@ class LiquidQuantities:
     """Temperature of the facility water to the CDUs."""
     facility_return_c: Annotated[F64, Quantity("C")]
     """Temperature of the facility water from the CDUs."""
+    coolant_m3s: Annotated[F64, Quantity("m3/s")]
+    """Flow of coolant through the CDUs."""
+    facility_m3s: Annotated[F64, Quantity("m3/s")]
+    """Flow of facility water through the CDUs."""
     cdu_pump_w: Annotated[F64, Quantity("W")]
     """Electric power of the pumps of the CDUs."""
     facility_pump_w: Annotated[F64, Quantity("W")]

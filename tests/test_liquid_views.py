@@ -1,7 +1,8 @@
-"""Liquid-cooled halls in recordings and figures."""
+"""Liquid-cooled halls in recordings, figures, reports and the commands of halls."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,16 +12,36 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_rgba
+from typer.testing import CliRunner, Result
 
 from rrd import images, read, scalars, verify
-from sdc_taichi import Recorder, Simulator, load_config
+from sdc_taichi import (
+    Actions,
+    ConfigError,
+    Recorder,
+    SdcError,
+    Simulator,
+    drivers_from_arrays,
+    load_config,
+    with_values,
+)
+from sdc_taichi.cli.app import app
+from sdc_taichi.control import make_controller
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.failover import failover_rows, study_failover
+from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
+from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.sim.design_liquid import design_liquid_values, solve_design_liquid
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.junction_parts import junction_terms
 from sdc_taichi.types import QUANTITIES, LiquidQuantities, StepResult
 from sdc_taichi.viz import liquid_figures, rack_maps
+from sdc_taichi.viz.floor_plan_figure import failover_figure
 from sdc_taichi.viz.liquid_loop import LOOP_FIELDS, junction_limits_c, loop_texts
 from sdc_taichi.viz.plotting import darken, drawn
 from sdc_taichi.viz.recording_liquid import CDU_PLOTS, LIQUID_PLOTS
 from sdc_taichi.viz.recording_series import line_factors
+from sdc_taichi.viz.report import report_html
 
 SMALL = ["name=ai", "hall.rows=2", "hall.racks_per_row=4", "hall.supply_approach_k=5",
          "hall.return_approach_k=-3", "hvac.sizing.model=design_day",
@@ -152,3 +173,124 @@ def test_history_stacks_heat_and_power(recorded: Recorded) -> None:
     light = np.asarray(drawn(figure, 60)).astype(int)
     darken(figure)
     assert light[0, 0].min() - int(np.asarray(drawn(figure, 60))[0, 0].max()) > 200
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run")
+    with Simulator(load_config("corrected", SMALL)) as sim:
+        simulate_to_folder(sim, make_controller("idle", sim.fleet), RunRequest("idle", 12), out)
+    return out
+
+
+def test_report_shows_loops_and_figures(folder: Path) -> None:
+    run = read_run(folder)
+    (steps,), (racks,) = read_steps(run, [0]), read_racks(run, [0])
+    assert racks["junction_c"].max() == pytest.approx(steps["junction_max_c"].max(), abs=1e-3)
+    assert (racks["junction_c"][AIR_RACKS] == 0).all()
+    html = report_html(run)
+    section = html[html.index("Liquid cooling of ai</h2>") :].partition("</section>")[0]
+    assert section.count("<figure>") == 3
+    facility_w = steps["it_w"] + steps["overhead_w"]
+    for value in (
+        steps["reuse_w"].sum() / facility_w.sum(),
+        (facility_w - steps["reuse_w"]).sum() / steps["it_w"].sum(),
+        facility_w.sum() / (steps["it_w"] - steps["it_fan_w"]).sum(),
+    ):
+        assert f"<dd>{value:.4g}</dd>" in section
+    assert "ASHRAE class W40 for 3 h." in section
+
+
+@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
+def test_parts_of_a_junction_add_up(thermal: str) -> None:
+    base = with_values(load_config("corrected", SMALL), {"simulation.thermal": thermal})
+    causes = {
+        "flow_k": None,
+        "shortfall_k": {"kind": "heat_wave", "offset_k": 25},
+        "limit_k": None,
+    }
+    configs = [
+        with_values(base, {"name": cause, "events.scheduled": [
+            {**event, "start_h": 0, "duration_h": 9}] if event else []})
+        for cause, event in causes.items()
+    ]  # fmt: skip
+    actions = Actions(cdu_flow=np.array([0.5, 1.0, 1.0]), power_cap=np.array([1.0, 1.0, 0.6]))
+    ones = np.ones(8)
+    drivers = drivers_from_arrays(20 * ones, 15 * ones, 0 * ones, ones, size=len(configs))
+    with Simulator(configs, drivers=drivers) as sim:
+        sim.reset()
+        for _ in range(8):
+            result = sim.step(actions)
+        parts = {cause: sim.junction_parts(3, dc) for dc, cause in enumerate(causes)}
+        with pytest.raises(SdcError, match=r"rack 4: is cooled by air; valid is .* such as 2"):
+            sim.junction_parts(4)
+    for dc, (cause, each) in enumerate(parts.items()):
+        terms = dict(junction_terms(each))
+        assert sum(terms.values()) == pytest.approx(each.junction_c, abs=0.03)
+        assert each.junction_c == pytest.approx(result.rack_junction_c[8 * dc + 3], abs=1e-3)
+        assert terms["facility water"] == result.facility_supply_c[dc]
+        size_k = {name: abs(getattr(each, name)) for name in causes}
+        assert size_k[cause] > 1.0
+        others = {abs(getattr(other, cause)) for name, other in parts.items() if name != cause}
+        assert size_k[cause] >= max(others)
+
+
+def test_why_explains_the_hottest_junction_of_config_and_run(folder: Path) -> None:
+    command = ["hall", "why", "--of", "junction", "--json"]
+    at_design = call(*command, "corrected", *SMALL)
+    shown = json.loads(call("hall", "show", "corrected", *SMALL, "--json").stdout)["liquid"]
+    assert json.loads(at_design.stdout)["junction_c"] == pytest.approx(shown["junction_max_c"])
+    of_run = json.loads(call(*command, folder).stdout)
+    (steps,) = read_steps(read_run(folder), [0])
+    step = int(steps["junction_max_c"].argmax())
+    assert of_run["junction_c"] == pytest.approx(steps["junction_max_c"].iloc[step])
+    assert f"hottest step {step} of" in of_run["at"]
+    assert (
+        "rack 3 (row 0, place 3)"
+        in call("hall", "why", folder, "--of", "junction", "--rack", 3).stdout
+    )
+
+
+def test_show_describes_heat_cdus_and_water() -> None:
+    config = load_config("corrected", SMALL)
+    liquid = solve_design_liquid(config)
+    shown = design_liquid_values(liquid)
+    heat_w = shown["liquid_heat_w"] + shown["liquid_air_w"] - 0.1 * shown["cdu_pump_w"]
+    assert heat_w == pytest.approx(shown["liquid_it_w"], rel=0.02)
+    assert shown["liquid_it_w"] == pytest.approx(4 * 132e3, rel=0.02)
+    assert shown["facility_setpoint_c"] == 36.0
+    assert shown["facility_class"] == "W32"
+    # Warmer facility water makes GPUs throttle.
+    margin_k = 85.0 - liquid.parts(None).junction_c
+    assert shown["warmest_water_c"] > 36.0 + 0.8 * margin_k
+    assert shown["warmest_water_c"] < 36.0 + margin_k
+    text = call("hall", "show", "corrected", *SMALL).stdout
+    assert "type gpu: 4 racks of 132.0 kW: 115.0 kW into 138 l/min of coolant" in text
+    assert "1 loop with 2 CDUs of 520 kW each, 1 of them needed (N+1)" in text
+    assert "at most 36.0 C keeps the setpoint (class W32)" in text
+
+
+def test_failover_of_liquid_cooling_counts_seconds() -> None:
+    study = study_failover(load_config("corrected", SMALL), "liquid")
+    rows = {row["lost"]: row for row in failover_rows(study, range(len(study.losses)))}
+    assert rows["no loss"]["time_to_throttle_s"] is None
+    assert rows["CDU 0"]["time_to_throttle_s"] is None, "the other CDU takes its load"
+    both, pumps = rows["CDU 0 + 1"], rows["facility pumps"]
+    assert both["time_to_trip_s"] <= 2.0
+    assert both["racks_off"] == 4
+    assert 10.0 < pumps["time_to_throttle_s"] < 60.0
+    assert pumps["time_to_trip_s"] > pumps["time_to_throttle_s"]
+    assert rows["leak at rack 2"]["racks_off"] == 1
+    half, whole = (rows[name]["hottest_junction_60_min_c"] for name in ("half of cooler", "cooler"))
+    assert rows["no loss"]["hottest_junction_60_min_c"] <= half < whole
+    assert study.losses[study.worst[0]].name == "CDU 0 + 1"
+    curves: Any = failover_figure(study).axes[1]
+    assert curves.get_ylabel() == "hottest junction of the hall (°C)"
+    with pytest.raises(ConfigError, match="no rack is liquid-cooled"):
+        study_failover(load_config("corrected"), "liquid")
+
+
+def call(*arguments: object) -> Result:
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exit_code == 0, done.output
+    return done

@@ -17,6 +17,7 @@ from sdc_taichi.run.rack_places import RackPlaces
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
 
+from .liquid_loop import junction_limits_c
 from .plotting import (
     BLUE,
     DPI,
@@ -62,7 +63,7 @@ class RackValues:
     """Values of the R racks of a floor plan, which the colours of the racks show."""
 
     values: F64
-    """Value of each rack, (R,)."""
+    """Value of each rack, (R,); racks whose values are masked are grey."""
     label: str
     """Name of the values with their unit, for the colour bar."""
     marked: int
@@ -161,11 +162,12 @@ def _add_title_and_legend(axes: Axes, title: str, *, columns: int) -> None:
 
 
 def failover_figure(study: Failover) -> Figure:
-    """Draw a failover study: rack inlets after the worst loss, and hottest inlets over time.
+    """Draw a failover study: racks after the worst loss, and their hottest one over time.
 
     The floor plan shows the inlets after the worst loss of cooling, and colours each CRAC unit by
     the effect of losing that unit alone: racks trip, racks throttle, or neither. The curves show
-    the hottest inlet of the hall after each of the worst losses.
+    the hottest inlet of the hall after each of the worst losses. Studies of liquid cooling show
+    junctions in place of inlets.
 
     Args:
         study: result of ``study_failover``.
@@ -176,12 +178,14 @@ def failover_figure(study: Failover) -> Figure:
     figure = new_figure(13.0, 5.6)
     axes, curves = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     worst = study.worst[0]
-    inlet_c = study.rack_inlet_c[worst]
-    hottest = int(inlet_c.argmax())
+    rack_c = study.rack_c[worst]
+    hottest = int(rack_c.argmax())
     page = _page(study.config.hall, study.config.hvac.crac.units, FAILOVER_SIDE_IN)
     _draw_room(axes, page)
     label = "hottest inlet of the rack (°C)"
-    _draw_racks(axes, page, RackValues(inlet_c, label, hottest, "hottest rack"))
+    if study.lost == "liquid":
+        rack_c, label = np.ma.masked_equal(rack_c, 0.0), "junction (°C)"
+    _draw_racks(axes, page, RackValues(rack_c, label, hottest, "hottest rack"))
     if any(loss.units for loss in study.losses):
         _draw_failed_units(axes, page, study)
     axes.set_title(
@@ -375,6 +379,7 @@ def _rack_boxes(page: _Page) -> F64:
 
 def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
     """Draw racks in the colours of their values, with the values as numbers if they fit."""
+    from matplotlib import colormaps
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Polygon
     from matplotlib.ticker import MaxNLocator
@@ -387,7 +392,7 @@ def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
     racks = PolyCollection(
         list(boxes),
         array=shown.values,
-        cmap="inferno",
+        cmap=colormaps["inferno"].with_extremes(bad="#DDDDDD"),
         clim=(low, high),
         edgecolor="white" if has_edges else "face",
         linewidth=0.8 if has_edges else 0.1,
@@ -395,6 +400,8 @@ def _draw_racks(axes: Axes, page: _Page, shown: RackValues) -> None:
     axes.add_collection(racks)
     if page.fits(*size_m, RACK_LABEL_PX):
         for (x, y), value in zip(plan.centre_m, shown.values, strict=True):
+            if value is np.ma.masked:
+                continue
             ink = "black" if value > (low + high) / 2 else "white"
             text = f"{value:z.{shown.digits}f}"
             axes.text(*page.point(x, y), text, color=ink, ha="center", va="center", fontsize=9)
@@ -491,24 +498,26 @@ def _airflow_text(value: float) -> str:
 
 
 def _draw_curves(axes: Axes, study: Failover) -> None:
-    """Draw the hottest inlet over time after the worst losses, and the protection's limits."""
+    """Draw the hottest rack over time after the worst losses, and the protection's limits."""
     minutes = np.arange(MINUTES + 1)
-    # At minute 0 all curves have the steady-state inlet of the hall without a loss.
-    inlet_c = study.inlet_max_c[[0, *range(MINUTES)]]
-    inlet_c[0] = inlet_c[0, 0]
+    # At minute 0 all curves have the steady-state temperature of the hall without a loss.
+    hottest_c = study.hottest_c[[0, *range(MINUTES)]]
+    hottest_c[0] = hottest_c[0, 0]
     drawn = [i for i in study.worst if i != 0][:CURVES]
     for i, colour in zip(drawn, LINE_COLOURS, strict=False):
-        axes.plot(minutes, inlet_c[:, i], color=colour, label=study.losses[i].name)
-    axes.plot(minutes, inlet_c[:, 0], color=GREY, linewidth=2.5, label="no loss")
+        axes.plot(minutes, hottest_c[:, i], color=colour, label=study.losses[i].name)
+    axes.plot(minutes, hottest_c[:, 0], color=GREY, linewidth=2.5, label="no loss")
     protection = study.config.protection
     assert protection.ashrae_class is not None
     limit_c = allowable_c(protection.ashrae_class)[1]
-    for level_c, text in ((limit_c, "throttle"), (limit_c + protection.trip_margin_k, "trip")):
+    limits_c, quantity = (limit_c, limit_c + protection.trip_margin_k), "inlet"
+    if study.lost == "liquid":
+        limits_c, quantity = junction_limits_c(study.config) or limits_c, "junction"
+    for level_c, text in zip(limits_c, ("throttle", "trip"), strict=True):
         axes.axhline(level_c, color="black", linestyle=":", linewidth=1.0)
         axes.text(MINUTES, level_c, f"{text}, {level_c:g} °C", ha="right", va="bottom", fontsize=8)
-    axes.set(
-        xlim=(0, MINUTES), xlabel="minutes after the loss", ylabel="hottest inlet of the hall (°C)"
-    )
+    label = f"hottest {quantity} of the hall (°C)"
+    axes.set(xlim=(0, MINUTES), xlabel="minutes after the loss", ylabel=label)
     remove_frame(axes)
     title = f"full load, supply {study.supply_c:g} °C, class {protection.ashrae_class}"
     axes.set_title(title, fontsize=10, loc="left")

@@ -115,7 +115,7 @@ def _draw_stack(
 
 
 def loop_diagram(values: Mapping[str, float], liquid: LiquidConfig, title: str = "") -> Figure:
-    """Draw the loops with their temperatures, powers and heat in one step.
+    """Draw the loops with their temperatures, flows and heat in one step.
 
     Args:
         values: value of each of ``LOOP_FIELDS``, in its unit.

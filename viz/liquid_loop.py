@@ -18,9 +18,11 @@ LOOP_FIELDS = (
     "liquid_air_w",
     "cdu_return_c",
     "cdu_supply_c",
+    "coolant_m3s",
     "cdu_pump_w",
     "facility_return_c",
     "facility_supply_c",
+    "facility_m3s",
     "facility_pump_w",
     "reuse_w",
     "heat_pump_w",
@@ -120,8 +122,9 @@ def loop_texts(
         value_kw = values[name] / 1e3
         return f"{value_kw:,.0f} kW" if abs(value_kw) >= 100 else f"{value_kw:z.1f} kW"
 
-    def water(name: str) -> str:
-        return f"{values[name]:.1f} {degree}"
+    def water(temperature: str, flow: str = "") -> str:
+        text = f"{values[temperature]:.1f} {degree}"
+        return f"{text}\n{1e3 * values[flow]:.1f} l/s" if flow else text
 
     heat_pump = f"\nheat pump {kw('heat_pump_w')}" * (liquid.reuse.kind == "heat_pump")
     texts = {
@@ -131,9 +134,9 @@ def loop_texts(
         "trim": f"\ntakes {kw('trim_load_w')}\npower {kw('trim_chiller_w')}",
         "cooler": f"\nfans {kw('cooler_fan_w')}\npump {kw('facility_pump_w')}",
         "coolant return": water("cdu_return_c"),
-        "coolant supply": water("cdu_supply_c"),
+        "coolant supply": water("cdu_supply_c", "coolant_m3s"),
         "facility return": water("facility_return_c"),
-        "facility supply": water("facility_supply_c"),
+        "facility supply": water("facility_supply_c", "facility_m3s"),
         "air": f"to hall air {kw('liquid_air_w')}",
         "delivered": f"delivered {kw('reuse_w')}",
         "rejected": f"rejected {kw('liquid_rejected_w')}",

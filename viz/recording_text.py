@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, USUAL_CLASS, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
-from sdc_taichi.run.failover import DEVICES
+from sdc_taichi.run.failover import DEVICES, LIQUID_DEVICES
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, QUANTITIES, Reals, Status
@@ -274,8 +274,15 @@ def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
     """Return the description of an event for the log."""
     if event.kind == "crac_down":
         return "all CRAC units down" if event.target is None else f"CRAC unit {event.target} down"
-    if event.kind in DEVICES:
-        return f"{DEVICES[event.kind]}: {event.share:.0%} left"
+    devices = DEVICES | LIQUID_DEVICES
+    if event.kind in devices:
+        return f"{devices[event.kind]}: {event.share:.0%} left"
+    if event.kind in ("cdu_down", "cdu_pump_down"):
+        cdus = "all CDUs" if event.target is None else f"CDU {event.target}"
+        return f"{cdus} down" if event.kind == "cdu_down" else f"a pump down in {cdus}"
+    if event.kind == "leak":
+        assert event.target is not None
+        return f"leak: {rack_place(event.target, fleet.configs[event.dc].hall.racks_per_row)}"
     if event.kind == "rack_fan_failure":
         assert event.target is not None
         place = rack_place(event.target, fleet.configs[event.dc].hall.racks_per_row)

@@ -41,6 +41,7 @@ from .report_html import (
     time_span_text,
     time_text,
 )
+from .report_liquid import liquid_section
 from .report_metrics import MAX_DC_COLUMNS, has_shifted_work, metrics_section
 from .report_pictures import (
     MAX_DETAILED_DCS,
@@ -157,6 +158,9 @@ def report_html(run: RunFolder, comparison: Comparison | None = None) -> str:
         sections[heading] = data_center_section(
             run, dc, detailed=detailed, has_maps=comparison is None
         )
+        if dc.config.liquid is not None:
+            name = run.names[dc.index]
+            sections[f"Liquid cooling of {name}{of}"] = liquid_section(run, dc)
     sections["Why the hottest racks are hot"] = hot_racks_section(run, [dc.index for dc in shown])
     inputs = input_notes(run)
     if run.metrics["steps_done"] > 1:

@@ -205,8 +205,8 @@ def failover_command(
     *,
     config: ConfigOptions,
     of: Annotated[
-        Literal["units", "plant"],
-        typer.Option("--of", help="Lose CRAC units, or devices of the plant."),
+        Literal["units", "plant", "liquid"],
+        typer.Option("--of", help="Lose CRAC units, devices of the plant, or liquid cooling."),
     ] = "units",
     out: Annotated[
         Path | None,
@@ -217,7 +217,8 @@ def failover_command(
 ) -> None:
     """Lose each CRAC unit and each pair of them at full load: time to throttle and to trip.
 
-    An hour of transient temperatures in design weather. --out FILE.png also writes FILE.csv.
+    An hour of transient temperatures in design weather. --of liquid loses CDUs, their pumps,
+    facility pumps, the cooler, and the coolant of a rack. --out FILE.png also writes FILE.csv.
     """
     from sdc_taichi.run.failover import failover_rows, failover_values, study_failover
 
@@ -253,33 +254,45 @@ def _print_study(study: Failover) -> None:
         f"IT, supply {study.supply_c:g} C, outdoors {study.outdoor_c:.1f} C (wet bulb "
         f"{study.wet_bulb_c:.1f} C), class {study.config.protection.ashrae_class}"
     )
-    table = Table()
-    table.add_column("lost", no_wrap=True)
+    is_liquid = study.lost == "liquid"
     has_tank = bool(np.isfinite(study.tank_full_min).any())
+    unit = "s" if is_liquid else "min"
     names = (
-        *("throttle, min", "trip, min"),
+        *(f"throttle, {unit}", f"trip, {unit}"),
         *(f"C, {m} min" for m in SHOWN_AFTER_MIN),
+        *(("coolant, C",) if is_liquid else ()),
         *(("tank, min",) if has_tank else ()),
         "racks off",
     )
+    table = Table()
+    table.add_column("lost", no_wrap=True)
     for name in names:
         table.add_column(name, justify="right")
     order = [0, *(i for i in study.worst if i != 0)]
     for row in failover_rows(study, order[: LISTED + 1]):
-        name, throttle, trip, *inlets_c, _, tank, off = row.values()
-        minutes = ["-" if x is None else f"{x:.0f}" for x in (throttle, trip, tank)]
+        tank = row.pop("tank_full_min", None)
+        name, throttle, trip, *hottest_c, water_c, off = row.values()
+        times = ["-" if x is None else f"{x:.0f}" for x in (throttle, trip, tank)]
+        temperatures_c = [*hottest_c, *([water_c] if is_liquid else [])]
         table.add_row(
             name,
-            *minutes[:2],
-            *(f"{x:.1f}" for x in inlets_c),
-            *minutes[2:][: int(has_tank)],
+            *times[:2],
+            *(f"{x:.1f}" for x in temperatures_c),
+            *times[2:][: int(has_tank)],
             f"{off}",
         )
-    Console().print(table)
+    wide_console(100).print(table)
     if len(order) > LISTED + 1:
         typer.echo(f"The worst {LISTED} of {len(order) - 1} losses.")
     if study.note:
         typer.echo(study.note)
+    if is_liquid:
+        typer.echo(
+            f"C is the hottest junction of the hall; - is not within {MINUTES} min; coolant is "
+            f"what the racks get after {SHOWN_AFTER_MIN[0]} min; racks off are those after "
+            f"{MINUTES} min."
+        )
+        return
     typer.echo(
         "C is the hottest inlet of the hall; times count to the end of a whole minute, - is not "
         f"within {MINUTES} min; tank is the time until warm water fills the buffer tank; racks off "
@@ -402,7 +415,13 @@ LISTED_UNITS = 8
 def describe_hall(design: DesignHall) -> str:
     """Return a text about room, CRAC units, air and rows of a hall at its design point."""
     return "\n".join(
-        [*_room_lines(design), *_unit_lines(design), *_air_lines(design), *_rows(design)]
+        [
+            *_room_lines(design),
+            *_unit_lines(design),
+            *_air_lines(design),
+            *_liquid_lines(design),
+            *_rows(design),
+        ]
     )
 
 
@@ -437,6 +456,14 @@ def _type_lines(design: DesignHall) -> list[str]:
         of_type = named == name
         if not of_type.any():
             lines.append(f"  type {printable(name)}: no racks")
+            continue
+        if (rack := hall.rack_types[name].liquid) is not None:
+            lines.append(
+                f"  type {printable(name)}: {count_text(int(of_type.sum()), 'rack')} of "
+                f"{rack.design_it_w / 1e3:,.1f} kW: {rack.design_liquid_w / 1e3:,.1f} kW into "
+                f"{rack.design_lpm:,.0f} l/min of coolant, {rack.air_w(1.0) / 1e3:,.1f} kW into "
+                f"{_span(design.airflow_m3s[of_type], 3)} m3/s of air"
+            )
             continue
         groups = design.config.rack_groups()[int(np.argmax(of_type))]
         servers = " + ".join(f"{g.count:,} x {g.full_w:,.6g} W" for g in groups)
@@ -493,6 +520,44 @@ def _air_lines(design: DesignHall) -> list[str]:
         "the mean outlet",
         f"indices       SHI {air.shi:.3f}, RHI {1 - air.shi:.3f}, RTI {air.rti_pct:.1f} %",
     ]
+
+
+def _liquid_lines(design: DesignHall) -> list[str]:
+    """Return the lines about liquid-cooled racks at full load in design weather."""
+    from sdc_taichi.sim.design_liquid import design_liquid_values
+
+    if design.liquid is None:
+        return []
+    v, config = design_liquid_values(design.liquid), design.liquid.config
+
+    def class_text(name: str | None) -> str:
+        return f"class {name}" if name else "colder than any class"
+
+    per_loop = count_text(v["cdus_per_manifold"], "CDU")
+    needed = v["cdus_per_manifold"] - v["spare_cdus_per_manifold"]
+    redundancy = f"N+{v['spare_cdus_per_manifold']}" if v["spare_cdus_per_manifold"] else "N"
+    lines = [
+        f"liquid        {count_text(v['racks'], 'rack')}, {v['liquid_it_w'] / 1e3:,.1f} kW IT: "
+        f"{v['liquid_heat_w'] / 1e3:,.1f} kW into coolant, {v['liquid_air_w'] / 1e3:,.1f} kW into "
+        "the air of the hall",
+        f"coolant       {1e3 * v['coolant_m3s']:,.4g} l/s, {v['cdu_supply_c']:.1f} C to "
+        f"{v['cdu_return_c']:.1f} C; hottest junction {v['junction_max_c']:.1f} C",
+        f"CDUs          {count_text(v['manifolds'], 'loop')} with {per_loop} of "
+        f"{v['cdu_w'] / 1e3:,.0f} kW each, {needed} of them needed ({redundancy}); pumps "
+        f"{v['cdu_pump_w'] / 1e3:,.1f} kW",
+        f"facility      {v['facility_supply_c']:.1f} C to {v['facility_return_c']:.1f} C outdoors "
+        f"at {v['outdoor_c']:.1f} C, wet bulb {v['wet_bulb_c']:.1f} C; {config.facility.rejection} "
+        f"cooler, fans {v['cooler_fan_w'] / 1e3:,.1f} kW, pumps "
+        f"{v['facility_pump_w'] / 1e3:,.1f} kW",
+        f"water         at most {v['facility_setpoint_c']:.1f} C keeps the setpoint "
+        f"({class_text(v['facility_class'])})",
+    ]
+    if v["warmest_water_c"] is not None:
+        lines[-1] += (
+            f"; GPUs throttle above {v['warmest_water_c']:.1f} C "
+            f"({class_text(v['warmest_water_class'])})"
+        )
+    return lines
 
 
 def _rows(design: DesignHall) -> list[str]:

@@ -1,12 +1,13 @@
-"""``sdc-taichi hall why``: explain the inlet temperature of a rack as a sum of its causes."""
+"""``sdc-taichi hall why``: explain inlet or junction of a rack as a sum of its causes."""
 
 from __future__ import annotations
 
 import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from sdc_taichi.cli.options import (
@@ -29,6 +30,11 @@ from sdc_taichi.sim.inlet_parts import (
     rack_text,
     state_texts,
 )
+from sdc_taichi.types import fields_of
+
+if TYPE_CHECKING:
+    from sdc_taichi.run.folder_reader import RunFolder
+    from sdc_taichi.sim.junction_parts import JunctionParts
 
 
 def why_command(
@@ -55,6 +61,10 @@ def why_command(
         int | None,
         typer.Option(min=0, help="Step of a run, which is simulated again. [default: the hottest]"),
     ] = None,
+    of: Annotated[
+        Literal["inlet", "junction"],
+        typer.Option("--of", help="Explain the inlet, or the junction of a liquid-cooled rack."),
+    ] = "inlet",
     out: Annotated[
         Path | None,
         out_option("Draw what each rack adds to the inlet on the floor plan.", "FILE.png"),
@@ -63,13 +73,23 @@ def why_command(
     force: Annotated[bool, force_option()] = False,
     as_json: Annotated[bool, json_option("Print all parts as JSON.")] = False,
 ) -> None:
-    """Say why the inlet of a rack is as warm as it is: a sum of parts without a remainder.
+    """Say why an inlet or a junction is as warm as it is: a sum of parts without a remainder.
 
     At the design point of a config, at full load; or in the hottest step of a run, whose folder
-    holds the air of that step. Any other step is simulated again from the start of the run.
+    holds the air of that step. Any other step is simulated again from the start of the run, as is
+    the step of a junction.
     """
     check_out_file(out, ".png", force=force)
     run_folder = _run_folder(source)
+    if of == "junction":
+        if out is not None:
+            raise ConfigError("--out: given with --of junction; valid with --of inlet")
+        if run_folder is None:
+            junction = _junction_at_design_point(source, overrides, dc, step, rack)
+        else:
+            junction = _junction_in_run(run_folder, overrides, dc, step, rack)
+        _print_junction(junction, as_json=as_json)
+        return
     if run_folder is None:
         name, config, at, inlets = _at_design_point(source, overrides, dc, step)
     else:
@@ -85,6 +105,68 @@ def why_command(
     typer.echo(describe_inlet(parts, config.hall.racks_per_row))
     if out is not None:
         typer.echo(f"Floor plan: {printable(out)}")
+
+
+_ExplainedJunction = tuple[str, DataCenterConfig, str, "JunctionParts"]
+"""Name of a data center, its config, the moment of its junctions as text, and a junction."""
+
+
+def _junction_at_design_point(
+    source: list[str] | None,
+    overrides: list[str] | None,
+    dc: str | None,
+    step: int | None,
+    rack: str | None,
+) -> _ExplainedJunction:
+    """Compute a junction at the design point of a config; without a rack, the hottest one."""
+    from sdc_taichi.sim.design_liquid import solve_design_liquid
+
+    _check_no_run_options(dc, step)
+    config, _ = read_config(source, overrides)
+    index = None if rack is None else parse_rack(rack, config.hall)
+    return config.name, config, "at its design point", solve_design_liquid(config).parts(index)
+
+
+def _junction_in_run(
+    folder: Path,
+    overrides: list[str] | None,
+    dc: str | None,
+    step: int | None,
+    rack: str | None,
+) -> _ExplainedJunction:
+    """Simulate a junction of a run again; without step and rack, the hottest one."""
+    from sdc_taichi.run.folder_reader import read_configs, read_steps
+    from sdc_taichi.run.inlets_of_run import junction_at_step
+
+    run = _read_run(folder, overrides)
+    steps = read_steps(run, range(len(run.names)), ["junction_max_c"])
+    hottest_c = [float(each["junction_max_c"].max()) for each in steps]
+    index = _index_of(run, run.names[int(np.argmax(hottest_c))] if dc is None else dc)
+    at_step = int(steps[index]["junction_max_c"].argmax()) if step is None else step
+    (config,) = read_configs(run, [index])
+    wanted = None if rack is None else parse_rack(rack, config.hall)
+    at = "at the end of its hottest step" if step is None else "at the end of step"
+    parts = junction_at_step(run, index, at_step, wanted)
+    return run.names[index], config, f"{at} {at_step} of {folder}", parts
+
+
+def _print_junction(explained: _ExplainedJunction, *, as_json: bool) -> None:
+    """Print the terms of the junction of a liquid-cooled rack."""
+    from sdc_taichi.sim.junction_parts import junction_state, junction_terms
+
+    name, config, at, parts = explained
+    if as_json:
+        typer.echo(json.dumps({"name": name, "at": at, **fields_of(parts)}, indent=2))
+        return
+    (first, facility_c), *others = junction_terms(parts)
+    lines = [
+        f"{printable(name)}, {at}",
+        f"{rack_text(parts.rack, config.hall.racks_per_row)}: junction {parts.junction_c:.2f} C",
+        f"  {facility_c:>7.2f} C  {first}",
+        *(f"  {k:>+7.2f} K  {text}" for text, k in others),
+        junction_state(parts),
+    ]
+    typer.echo("\n".join(lines))
 
 
 _Explained = tuple[str, DataCenterConfig, str, Inlets]
@@ -111,28 +193,45 @@ def _at_design_point(
     """Compute the inlets at the design point of a config."""
     from sdc_taichi.sim.design_hall import solve_design_hall
 
+    _check_no_run_options(dc, step)
+    config, _ = read_config(source, overrides)
+    return config.name, config, "at its design point", solve_design_hall(config).inlets
+
+
+def _check_no_run_options(dc: str | None, step: int | None) -> None:
+    """Raise ``ConfigError`` for options that need the folder of a run."""
     for option, value in (("--dc", dc), ("--step", step)):
         if value is not None:
             raise ConfigError(f"{option}: given without a run; valid with the folder of a run")
-    config, _ = read_config(source, overrides)
-    return config.name, config, "at its design point", solve_design_hall(config).inlets
+
+
+def _read_run(folder: Path, overrides: list[str] | None) -> RunFolder:
+    """Read a run; overrides are an error."""
+    from sdc_taichi.run.folder_reader import read_run
+
+    if overrides:
+        raise ConfigError("--set: given with the folder of a run; valid with a preset or file")
+    return read_run(folder)
+
+
+def _index_of(run: RunFolder, name: object) -> int:
+    """Return the index of a data center of a run by its name."""
+    if name not in run.names:
+        shown = ", ".join(run.names[:10]) + (", ..." if len(run.names) > 10 else "")
+        raise ConfigError(f"--dc {name!r}: no such data center in {run.path}; valid: {shown}")
+    return run.names.index(str(name))
 
 
 def _in_run(
     folder: Path, overrides: list[str] | None, dc: str | None, step: int | None
 ) -> _Explained:
     """Read or simulate the inlets of a data center at the end of a step of a run."""
-    from sdc_taichi.run.folder_reader import is_number, read_run
+    from sdc_taichi.run.folder_reader import is_number
     from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
 
-    if overrides:
-        raise ConfigError("--set: given with the folder of a run; valid with a preset or file")
-    run = read_run(folder)
+    run = _read_run(folder, overrides)
     name = run.metrics["total"].get("hottest_dc") if dc is None else dc
-    if name not in run.names:
-        shown = ", ".join(run.names[:10]) + (", ..." if len(run.names) > 10 else "")
-        raise ConfigError(f"--dc {name!r}: no such data center in {folder}; valid: {shown}")
-    index = run.names.index(name)
+    index = _index_of(run, name)
     metrics = run.metrics["data_centers"][index]["metrics"]
     hottest_step = metrics.get("hottest_step")
     wanted = hottest_step if step is None else step

@@ -38,6 +38,8 @@ W_CLASS_LIMITS_C: dict[str, float] = {
     "W45": 45.0,
 }
 """Highest facility water temperature of each ASHRAE TC 9.9 (2021) class, in C."""
+WARMEST_CLASS = "W+"
+"""ASHRAE class of facility water that is warmer than any of ``W_CLASS_LIMITS_C``."""
 MOST_LEAKAGE_GAIN = 0.5
 """Largest gain of the loop of leakage and junction temperature that is still accepted; at 1 the
 junction temperature runs away."""
@@ -56,6 +58,13 @@ HeadKpa = Annotated[float, Field(ge=1, le=2000)]
 """Pressure difference of a pump, 1..2,000 kPa."""
 LitresPerKw = Annotated[float, Field(ge=0.01, le=1000)]
 """Volume of a loop divided by its design heat, 0.01..1,000 l/kW; large values stand for a tank."""
+
+
+def water_class(water_c: float) -> str:
+    """Return the coolest ASHRAE class that facility water of a temperature in C fulfils."""
+    # Water held at the limit of a class is within it, despite rounding.
+    kept = (name for name, limit_c in W_CLASS_LIMITS_C.items() if water_c <= limit_c + 1e-6)
+    return next(kept, WARMEST_CLASS)
 
 
 class LiquidRack(Section):

@@ -346,6 +346,8 @@ class LiquidSizing:
     cdu_w_per_k: F64
     """Capacity rate of coolant and of facility water at which the exchanger of each CDU has its UA,
     in W/K, (C,)."""
+    cdu_water_m3s: F64
+    """Design flow of facility water of each CDU, in m3/s, (C,)."""
     cdu_pump_w: F64
     """Power of the pumps of each CDU at design flow, in W, (C,)."""
     loop_j_per_k: F64
@@ -404,6 +406,7 @@ def size_liquid(fleet: LiquidFleet) -> LiquidSizing:
             cdu_w, c_w_per_k, c_w_per_k, approach_k=cdus.approach_k
         ),
         cdu_w_per_k=c_w_per_k,
+        cdu_water_m3s=c_w_per_k / (WATER_KG_M3 * WATER_J_PER_KG_K),
         cdu_pump_w=np.asarray(pump_w(cdus.head_kpa, cdu_m3s, cdus.pump_efficiency)),
         loop_j_per_k=litres * j_per_l[dc],
         heat_w=heat_w,

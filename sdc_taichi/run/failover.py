@@ -1,4 +1,4 @@
-"""Failover study of a hall: loss of CRAC units or plant devices at full load.
+"""Failover study of a hall: loss of CRAC units, plant devices or liquid cooling at full load.
 
 For each loss, a copy of the data center runs in one simulator. The loss lasts for the whole study.
 """
@@ -30,8 +30,8 @@ from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 
-Lost = Literal["units", "plant"]
-"""Kind of loss: CRAC units, or devices of the cooling plant."""
+Lost = Literal["units", "plant", "liquid"]
+"""Kind of loss: CRAC units, devices of the cooling plant, or devices that cool coolant."""
 
 MINUTES = 60
 """Length of a study, in one-minute steps."""
@@ -44,7 +44,7 @@ studied."""
 MOST_UNIT_SHARES = 100_000_000
 """Maximum number of shares of units in the supply of racks, summed over all losses: about 2 GB."""
 SHOWN_AFTER_MIN = (15, 60)
-"""Minutes after which studies report the hottest inlet."""
+"""Minutes after which studies report the hottest inlet or junction."""
 FULL = 0.999
 """Heat in a stratified tank divided by the most that it takes up, from which it counts as full."""
 DEVICES: dict[EventKind, str] = {
@@ -56,6 +56,13 @@ DEVICES: dict[EventKind, str] = {
     "outdoor_air_closed": "outdoor air",
 }
 """Text for the plant devices that each kind of event disables."""
+LIQUID_DEVICES: dict[EventKind, str] = {
+    "facility_pump_down": "facility pumps",
+    "cooler_down": "cooler",
+}
+"""Text for the devices of liquid cooling of which each kind of event leaves a share."""
+LEAK_L = 10.0
+"""Coolant that a leak of a study loses, in l."""
 CLASS = "A2"
 """ASHRAE class for thermal protection of the servers, if the config names no class."""
 
@@ -81,6 +88,9 @@ class Failover:
 
     config: DataCenterConfig
     """Config of the studied data center, without events."""
+    lost: Lost
+    """Kind of the losses. The temperatures of the racks are those of their junctions for losses of
+    liquid cooling, and otherwise of their inlets."""
     losses: tuple[Loss, ...]
     """The N losses, of which the first is the case without a loss."""
     note: str
@@ -93,33 +103,39 @@ class Failover:
     """Outdoor wet bulb, in C."""
     it_kw: float
     """IT power in the first minute without a loss, in kW."""
-    inlet_max_c: F64
-    """Highest inlet temperature of the hall in each minute, in C, (T, N)."""
-    rack_inlet_c: F64
-    """Highest inlet temperature of each rack after ``SHOWN_AFTER_MIN[0]`` minutes, in C, (N, R)."""
+    hottest_c: F64
+    """Highest temperature of the racks in each minute, in C, (T, N)."""
+    rack_c: F64
+    """Highest temperature of each rack after ``SHOWN_AFTER_MIN[0]`` minutes, in C, (N, R); 0 for
+    the junctions of racks cooled by air."""
     throttle_min: F64
-    """Minutes until the first rack throttles or trips, nan if none does, (N,)."""
+    """Minutes until the first rack throttles or trips, nan if none does, (N,); without liquid
+    cooling to the end of a whole minute."""
     trip_min: F64
-    """Minutes until the first rack trips, nan if none does, (N,)."""
+    """Minutes until the first rack trips, nan if none does, (N,); as ``throttle_min``."""
     racks_off: F64
     """Number of racks that are off at the end, (N,)."""
-    chilled_water_c: F64
-    """Chilled water supply at the end of each minute, in C, (T, N)."""
+    water_c: F64
+    """Supply of chilled water, or for losses of liquid cooling of coolant, at the end of each
+    minute, in C, (T, N)."""
     tank_full_min: F64
     """Minutes until warm water fills the stratified buffer tank, nan if it does not or if there is
     no such tank, (N,)."""
 
     @property
     def worst(self) -> list[int]:
-        """Indices of the losses, worst first: by time to trip, time to throttle, hottest inlet."""
-        inlet_c = self.inlet_max_c.max(axis=0)
+        """Indices of the losses, worst first: by times to trip and to throttle, and temperature."""
+        hottest_c = self.hottest_c.max(axis=0)
         never = float(MINUTES + 1)
         trip, throttle = (np.nan_to_num(x, nan=never) for x in (self.trip_min, self.throttle_min))
-        return [int(i) for i in np.lexsort((-inlet_c, throttle, trip))]
+        return [int(i) for i in np.lexsort((-hottest_c, throttle, trip))]
 
 
 def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
-    """Study the loss of each CRAC unit and pair of units, or of each plant device, at full load.
+    """Study losses of CRAC units, of plant devices or of liquid cooling at full load.
+
+    Each CRAC unit and pair of units is lost, or half and all of each plant device, or CDUs with
+    their pumps, facility pumps, the cooler and the coolant of a rack.
 
     The study uses design weather, transient halls, the design supply temperature within the range
     of setpoints, and the configured ASHRAE class of the servers, or else ``CLASS``.
@@ -129,10 +145,13 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
         lost: Kind of loss.
 
     Raises:
-        ConfigError: The inlet model is ``approach``, which models neither CRAC units nor room air.
+        ConfigError: The inlet model is ``approach``, which models neither CRAC units nor room air,
+            or no rack is liquid-cooled and losses of liquid cooling are asked for.
     """
     base, supply_c = _studied(config)
     losses, note = unit_losses(base) if lost == "units" else (plant_losses(base), "")
+    if lost == "liquid":
+        losses, note = liquid_losses(base)
     copies = [
         base.model_copy(
             update={
@@ -158,27 +177,35 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     with Simulator(build_fleet(copies), drivers=drivers) as sim:
         sim.reset()
         tank_most_kwh = sim.sizing.chilled_water.stratified_tank_j / J_PER_KWH
-        results = [_copied(sim.step(), step) for step in range(MINUTES)]
+        results = [_copied(sim.step(), step, lost) for step in range(MINUTES)]
     throttled, tripped = (np.array([r[name] for r in results]) for name in ("hot", "tripped"))
+    throttle_min, trip_min = _first_minute(throttled > 0), _first_minute(tripped > 0)
+    if lost == "liquid":
+        throttle_min, trip_min = (
+            _first_time_min(np.array([r[name] for r in results]))
+            for name in ("throttle_s", "trip_s")
+        )
+        throttle_min = np.fmin(throttle_min, trip_min)
     tank_kwh = np.array([r["tank_kwh"] for r in results])
     tank_left = [
         next((e.share for e in loss.events if e.kind == "tank_down"), 1.0) for loss in losses
     ]
-    shown = results[SHOWN_AFTER_MIN[0] - 1]["rack_inlet_c"]
+    shown = results[SHOWN_AFTER_MIN[0] - 1]["rack_c"]
     return Failover(
         config=base,
+        lost=lost,
         losses=losses,
         note=note,
         supply_c=supply_c,
         outdoor_c=outdoor_c,
         wet_bulb_c=wet_bulb_c,
         it_kw=float(results[0]["it_w"][0]) / 1e3,
-        inlet_max_c=np.array([r["inlet_max_c"] for r in results]),
-        rack_inlet_c=np.asarray(shown).reshape(len(losses), -1),
-        throttle_min=_first_minute(throttled > 0),
-        trip_min=_first_minute(tripped > 0),
+        hottest_c=np.array([r["hottest_c"] for r in results]),
+        rack_c=np.asarray(shown).reshape(len(losses), -1),
+        throttle_min=throttle_min,
+        trip_min=trip_min,
         racks_off=tripped[-1],
-        chilled_water_c=np.array([r["chilled_water_c"] for r in results]),
+        water_c=np.array([r["water_c"] for r in results]),
         tank_full_min=_first_minute((tank_kwh > 0) & (tank_kwh > FULL * tank_most_kwh * tank_left)),
     )
 
@@ -230,6 +257,31 @@ def plant_losses(config: DataCenterConfig) -> tuple[Loss, ...]:
     return tuple(losses)
 
 
+def liquid_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
+    """Return the case without a loss and the losses of liquid cooling, and a note on omitted ones.
+
+    Raises:
+        ConfigError: No rack is liquid-cooled.
+    """
+    if config.liquid is None:
+        raise ConfigError(
+            f"{config.name}: no rack is liquid-cooled; valid are losses of units or of the plant"
+        )
+    cdus = config.liquid.cdus
+    of_manifold, rack = range(cdus.per_manifold), next(iter(config.liquid_racks()))
+    losses = [Loss("no loss", (), ())]
+    for kind, text in (("cdu_down", "CDU"), ("cdu_pump_down", "a pump of CDU")):
+        for lost in dict.fromkeys((of_manifold[:1], of_manifold)):
+            name = f"{text} {' + '.join(map(str, lost))}"
+            losses.append(Loss(name, (), tuple(_event(kind, unit=cdu) for cdu in lost)))
+    for device_kind, device in LIQUID_DEVICES.items():
+        for name, share in ((f"half of {device}", 0.5), (device, 0.0)):
+            losses.append(Loss(name, (), (_event(device_kind, share=share),)))
+    losses.append(Loss(f"leak at rack {rack}", (), (_event("leak", rack=rack, litres=LEAK_L),)))
+    note = f"Of {cdus.manifolds} manifolds, the first loses its CDUs." if cdus.manifolds > 1 else ""
+    return tuple(losses), note
+
+
 def _event(kind: Any, **more: Any) -> ScheduledEvent:
     """Return an event that lasts for a whole study."""
     return ScheduledEvent(kind=kind, start_h=0.0, duration_h=float(MINUTES), **more)
@@ -269,19 +321,22 @@ def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
     return with_values(config, values), setpoint_c - over_supply_k
 
 
-def _copied(result: StepResult, step: int) -> dict[str, Any]:
+def _copied(result: StepResult, step: int, lost: Lost) -> dict[str, Any]:
     """Return copies of the quantities of a step that a study needs."""
+    is_liquid = lost == "liquid"
     values: dict[str, Any] = {
-        "inlet_max_c": result.inlet_max_c,
+        "hottest_c": result.junction_max_c if is_liquid else result.inlet_max_c,
         "tripped": result.tripped_racks,
         "hot": result.throttled_racks + result.tripped_racks,
-        "chilled_water_c": result.chilled_water_c,
+        "throttle_s": result.throttle_s,
+        "trip_s": result.trip_s,
+        "water_c": result.cdu_supply_c if is_liquid else result.chilled_water_c,
         "tank_kwh": result.tank_heat_kwh,
     }
     if step == 0:
         values["it_w"] = result.it_w
     if step == SHOWN_AFTER_MIN[0] - 1:
-        values["rack_inlet_c"] = result.rack_inlet_max_c
+        values["rack_c"] = result.rack_junction_c if is_liquid else result.rack_inlet_max_c
     return {name: np.array(each, dtype=np.float64) for name, each in values.items()}
 
 
@@ -291,6 +346,17 @@ def _first_minute(happens: Any) -> F64:
     The result is nan if it is never True. ``happens`` has shape (T, N).
     """
     return np.where(happens.any(axis=0), np.argmax(happens, axis=0) + 1.0, np.nan)
+
+
+def _first_time_min(time_s: F64) -> F64:
+    """Return the minutes to the first time of a study, nan without one, (N,).
+
+    Args:
+        time_s: Time from the start of each minute, in s, (T, N); negative if there is none.
+    """
+    minute = np.argmax(time_s >= 0.0, axis=0)
+    first_s = np.take_along_axis(time_s, minute[None], axis=0)[0]
+    return np.where(first_s >= 0.0, minute + first_s / 60.0, np.nan)
 
 
 def failover_values(study: Failover) -> dict[str, Any]:
@@ -309,19 +375,23 @@ def failover_values(study: Failover) -> dict[str, Any]:
 
 def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]:
     """Convert losses in the given order to plain values; keys name the units, None means never."""
+    is_liquid, first = study.lost == "liquid", SHOWN_AFTER_MIN[0]
+    times = {"throttle": study.throttle_min, "trip": study.trip_min}
+    unit, per_min = ("s", 60.0) if is_liquid else ("min", 1.0)
+    place, water = ("junction", "coolant") if is_liquid else ("inlet", "chilled_water")
     return [
         {
             "lost": study.losses[i].name,
-            "time_to_throttle_min": finite_or_none(study.throttle_min[i]),
-            "time_to_trip_min": finite_or_none(study.trip_min[i]),
             **{
-                f"hottest_inlet_{minute}_min_c": float(study.inlet_max_c[minute - 1, i])
+                f"time_to_{name}_{unit}": finite_or_none(per_min * time_min[i])
+                for name, time_min in times.items()
+            },
+            **{
+                f"hottest_{place}_{minute}_min_c": float(study.hottest_c[minute - 1, i])
                 for minute in SHOWN_AFTER_MIN
             },
-            f"chilled_water_{SHOWN_AFTER_MIN[0]}_min_c": float(
-                study.chilled_water_c[SHOWN_AFTER_MIN[0] - 1, i]
-            ),
-            "tank_full_min": finite_or_none(study.tank_full_min[i]),
+            f"{water}_{first}_min_c": float(study.water_c[first - 1, i]),
+            **({} if is_liquid else {"tank_full_min": finite_or_none(study.tank_full_min[i])}),
             "racks_off": int(study.racks_off[i]),
         }
         for i in order

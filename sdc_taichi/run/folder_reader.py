@@ -266,7 +266,8 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
     Column ``hottest_h`` is the time, in h, during which the rack had the hottest inlet of its hall,
     within ``TIE_K``. Column ``inlet_max_c`` is the highest inlet temperature of the rack, in C.
     Column ``above_27_h`` is the time, in h, during which its hottest inlet was above the
-    recommended 27 C.
+    recommended 27 C. Data centers with liquid-cooled racks have a column ``junction_c``, the
+    junction temperature in the step of the hottest junction, in C, 0 for racks cooled by air.
 
     Args:
         run: The run.
@@ -301,7 +302,20 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
                 f"hottest_steps and above_27_steps, 0..{done}, and inlet_max_c of each rack"
             )
         columns = {"hottest_h": hottest * step_h, "inlet_max_c": highest_c}
-        out.append(pd.DataFrame({**columns, "above_27_h": above * step_h}))
+        columns["above_27_h"] = above * step_h
+        if "junction_c" in stored[dc]:
+            junction_c = stored[dc]["junction_c"]
+            if not (
+                isinstance(junction_c, list)
+                and len(junction_c) == len(hottest)
+                and all(map(is_number, junction_c))
+            ):
+                raise SdcError(
+                    f"{run.steps_path}: junction_c of sdc_taichi_racks[{dc}] is "
+                    f"{shortened(junction_c)}; valid is a list of {len(hottest)} numbers"
+                )
+            columns["junction_c"] = np.array(junction_c, dtype=float)
+        out.append(pd.DataFrame(columns))
     return out
 
 

@@ -1,8 +1,10 @@
-"""Causes of inlet temperatures in a finished run: in its hottest step, or in any step."""
+"""Causes of inlet and junction temperatures in a finished run, in one of its steps."""
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sdc_taichi.config import DataCenterConfig
@@ -14,6 +16,7 @@ from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.steps_file import air_from_values
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.inlet_parts import Inlets
+from sdc_taichi.sim.junction_parts import JunctionParts
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
 
@@ -82,6 +85,35 @@ def inlets_at_step(run: RunFolder, dc: int, step: int, *, allow_code: bool = Fal
         SdcError: The step does not exist, the controller is not available by name, an input file is
             missing, or the run is not reproduced.
     """
+    with _simulated_to(run, dc, step, allow_code=allow_code) as (sim, result):
+        inlets = Inlets(sim.fleet, 0, sim.intake_air())
+        return InletsAtStep(step, float(result.inlet_max_c[0]), sim.fleet.configs[0], inlets)
+
+
+def junction_at_step(
+    run: RunFolder, dc: int, step: int, rack: int | None, *, allow_code: bool = False
+) -> JunctionParts:
+    """Split a junction temperature by simulating the run again, as ``inlets_at_step`` does.
+
+    Args:
+        run: The run.
+        dc: Index of the data center.
+        step: Index of the step, counted from 0 at reset.
+        rack: Index of the rack in its data center; None is that of the hottest junction.
+        allow_code: True if the run's controller may be an import path.
+
+    Raises:
+        SdcError: As ``inlets_at_step``, or the rack is not liquid-cooled.
+    """
+    with _simulated_to(run, dc, step, allow_code=allow_code) as (sim, _):
+        return sim.junction_parts(rack)
+
+
+@contextlib.contextmanager
+def _simulated_to(
+    run: RunFolder, dc: int, step: int, *, allow_code: bool
+) -> Iterator[tuple[Simulator, StepResult]]:
+    """Simulate a data center of a run alone up to a step; give simulator and result of the step."""
     metrics = run.metrics
     if not 0 <= step < metrics["steps_done"]:
         raise ConfigError(f"step {step}: valid is 0..{metrics['steps_done'] - 1} of {run.path}")
@@ -100,17 +132,16 @@ def inlets_at_step(run: RunFolder, dc: int, step: int, *, allow_code: bool = Fal
             on_step=lambda result: results.__setitem__(slice(None), [result]),
             stop=lambda: bool(results) and results[0].step == step,
         )
-        air = sim.intake_air()
-    (steps,) = read_steps(run, [dc], ["inlet_max_c"])
-    stored_c, again_c = float(steps["inlet_max_c"].iloc[step]), float(results[0].inlet_max_c[0])
-    if not abs(stored_c - again_c) <= SAME_K:
-        raise SdcError(
-            f"{run.path}: step {step} of {run.names[dc]}, simulated again alone, has a hottest "
-            f"inlet of {again_c:.3f} C, and had {stored_c:.3f} C; valid is a run whose input files "
-            "and versions are those of today, under a controller that treats a data center alike "
-            "in any batch"
-        )
-    return InletsAtStep(step, again_c, fleet.configs[0], Inlets(fleet, 0, air))
+        (steps,) = read_steps(run, [dc], ["inlet_max_c"])
+        stored_c, again_c = float(steps["inlet_max_c"].iloc[step]), float(results[0].inlet_max_c[0])
+        if not abs(stored_c - again_c) <= SAME_K:
+            raise SdcError(
+                f"{run.path}: step {step} of {run.names[dc]}, simulated again alone, has a hottest "
+                f"inlet of {again_c:.3f} C, and had {stored_c:.3f} C; valid is a run whose input "
+                "files and versions are those of today, under a controller that treats a data "
+                "center alike in any batch"
+            )
+        yield sim, results[0]
 
 
 def _fleet_of(run: RunFolder, dc: int) -> Fleet:

@@ -6,6 +6,7 @@ import json
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,6 +32,8 @@ The value is a list with one object per data center, whose lists have an entry f
 ``hottest_steps`` is the number of steps in which the rack had the hottest inlet of its hall, within
 ``TIE_K``; ``inlet_max_c`` is the highest inlet temperature of the rack over the run, in C;
 ``above_27_steps`` is the number of steps in which its hottest inlet was above ``RECOMMENDED_C``.
+Data centers with liquid-cooled racks also have ``junction_c``, the junction temperature of each
+rack in the step of the hottest junction, in C, 0 for racks cooled by air.
 """
 AIR_KEY = b"sdc_taichi_air"
 """Metadata key of the air before the racks, as JSON.
@@ -71,6 +74,7 @@ class StepsWriter:
         self._filled = 0
         self._first_step = 0
         self._racks = _RackCounts(sim.fleet)
+        self._junctions = _HottestJunctions(sim.fleet)
         self._air = HottestAir(sim) if sim.fleet.racks <= MOST_AIR_RACKS else None
         self._table = ParquetTable(
             path,
@@ -94,6 +98,7 @@ class StepsWriter:
             self._first_step = result.step
         self._values[:, self._filled] = self._columns(result)
         self._racks.add(result)
+        self._junctions.add(result)
         if self._air is not None:
             self._air.add(result)
         self._filled += 1
@@ -107,7 +112,9 @@ class StepsWriter:
             SdcError: The file cannot be written.
         """
         self._write_row_group()
-        tables = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
+        pairs = zip(self._racks.per_dc(), self._junctions.per_dc(), strict=True)
+        racks = [counts | junctions for counts, junctions in pairs]
+        tables = {RACKS_KEY: racks, AIR_KEY: self._air_per_dc()}
         texts = {key: json.dumps(value, allow_nan=False) for key, value in tables.items()}
         self._table.commit({key: text.encode() for key, text in texts.items()})
 
@@ -184,6 +191,32 @@ class _RackCounts:
         self._above_steps += np.count_nonzero(too_warm, axis=0)
         self._highest_c = np.maximum(self._highest_c, inlet_c.max(axis=0, initial=-np.inf))
         self._filled = 0
+
+
+class _HottestJunctions:
+    """Records the junctions of each data center in the step of its hottest junction."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._racks = [slice(*pair) for pair in pairwise(fleet.rack_offsets.tolist())]
+        self._hottest_c = {
+            dc: -np.inf for dc, config in enumerate(fleet.configs) if config.liquid is not None
+        }
+        self._junction_c: dict[int, list[float]] = {}
+
+    def add(self, result: StepResult) -> None:
+        """Add the junction temperatures of a step."""
+        for dc, hottest_c in self._hottest_c.items():
+            if result.junction_max_c[dc] > hottest_c:
+                self._hottest_c[dc] = float(result.junction_max_c[dc])
+                junction_c = result.rack_junction_c[self._racks[dc]]
+                self._junction_c[dc] = np.asarray(junction_c, np.float64).round(3).tolist()
+
+    def per_dc(self) -> list[dict[str, list[float]]]:
+        """Return the part of the value for ``RACKS_KEY`` of each data center."""
+        return [
+            {"junction_c": self._junction_c[dc]} if dc in self._junction_c else {}
+            for dc in range(len(self._racks))
+        ]
 
 
 @dataclass(frozen=True, slots=True)

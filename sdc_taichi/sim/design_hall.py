@@ -11,6 +11,12 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
 from sdc_taichi.hall.mix_weights import MixWeights
+from sdc_taichi.sim.design_liquid import (
+    DesignLiquid,
+    design_liquid_values,
+    rack_it_w,
+    solve_design_liquid,
+)
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.sim.inlet_parts import Inlets
@@ -82,6 +88,8 @@ class DesignHall:
     """Air recirculation; None with inlet model ``approach``, which does not compute airflows."""
     inlets: Inlets
     """Inlet temperatures of the racks, split into their causes."""
+    liquid: DesignLiquid | None
+    """Liquid-cooled racks; None without such racks."""
 
 
 def solve_design_hall(config: DataCenterConfig) -> DesignHall:
@@ -91,6 +99,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         SdcError: The hall cannot be laid out or has no steady state.
     """
     fleet = build_fleet(config)
+    liquid = None if config.liquid is None else solve_design_liquid(config)
     supply_c = config.hall.design_supply_c
     hall = Hall(fleet, "f64", samples=False)
     unit_supply_c = np.full(fleet.units, supply_c)
@@ -103,13 +112,14 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     approach_k[np.abs(approach_k) < _NO_APPROACH_K] = 0.0
     group = int(np.argmax(air_metrics.rank(hall.group_inlets())))
     rack = int(np.searchsorted(fleet.group_offsets, group, side="right")) - 1
+    it_w = np.asarray(sums.rack_cpu_w + sums.rack_fan_w, dtype=np.float64)
     first_server = fleet.server_offsets[fleet.group_offsets[rack]]
     return DesignHall(
         config=config,
         plan=plan,
         servers=fleet.servers,
         supply_c=supply_c,
-        it_w=np.asarray(sums.rack_cpu_w + sums.rack_fan_w, dtype=np.float64),
+        it_w=it_w if liquid is None else rack_it_w(liquid, it_w),
         airflow_m3s=np.asarray(sums.rack_airflow_m3s, dtype=np.float64),
         approach_k=approach_k,
         inlet_c=inlet_c,
@@ -122,6 +132,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         hottest_server=int(fleet.server_offsets[group] - first_server),
         air=_air_flows(fleet, sums, approach_k, supply_c),
         inlets=Inlets(fleet, 0, hall.intake_air(unit_supply_c)),
+        liquid=liquid,
     )
 
 
@@ -210,6 +221,7 @@ def design_hall_values(solved: DesignHall) -> dict[str, Any]:
         "hottest_server": solved.hottest_server,
         "hottest_inlet_c": float(solved.inlet_max_c.max()),
         **flows,
+        **({"liquid": design_liquid_values(solved.liquid)} if solved.liquid is not None else {}),
         **({"rack_types": list(types)} if (types := hall.rack_type_names()) else {}),
         "rack_it_w": solved.it_w.tolist(),
         "rack_airflow_m3s": solved.airflow_m3s.tolist(),

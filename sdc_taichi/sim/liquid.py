@@ -536,6 +536,43 @@ class Liquid:
         by_model_w = carnot(dc["trim_load_w"], point).power_w
         return np.where(np.isnan(self._trim_cop), by_model_w, by_cop_w)
 
+    @property
+    def junction_c(self) -> F64:
+        """Junction temperature of each rack at the end of the last step, in C, (L,)."""
+        return np.asarray(self._arrays["rack_state"][0])
+
+    def values_of_rack(self, rack: int) -> dict[str, float]:
+        """Return what decides the junction of a rack at the end of the last step, by name.
+
+        Coefficients, inputs and results have the names of ``kernels/liquid_arguments.py``. Besides,
+        ``cdus`` and ``cdus_up`` are the numbers of all and of running CDUs of its manifold, and
+        ``valve`` is the mean opening of their valves.
+
+        Args:
+            rack: Index of the rack among all racks with coolant.
+        """
+        loop = self.fleet.rack_manifold[rack]
+        coefficients = {
+            name: np.broadcast_to(values, self._racks)[rack]
+            for name, values in self._rack_coefficients().items()
+        }
+        parts = (
+            ("rack", "inputs", spec.RACK_INPUTS, rack),
+            ("rack", "out", spec.RACK_OUT, rack),
+            ("rack", "state", spec.RACK_STATE, rack),
+            ("loop", "out", ("w_per_k", "wanted_c"), loop),
+            ("loop", "state", spec.LOOP_STATE, loop),
+            ("dc", "state", spec.DC_STATE, self.fleet.manifold_dc[loop]),
+        )
+        values = dict(coefficients)
+        for of, kind, names, index in parts:
+            values |= dict(zip(names, self._arrays[f"{of}_{kind}"][:, index], strict=False))
+        cdus = slice(*self.fleet.cdu_offsets[loop : loop + 2])
+        up = self._inputs["up"][cdus]
+        valve = dict(zip(spec.CDU_OUT, self._arrays["cdu_out"], strict=True))["valve"][cdus]
+        values |= {"cdus": len(up), "cdus_up": up.sum(), "valve": valve.mean()}
+        return {name: float(value) for name, value in values.items()}
+
     def close(self) -> None:
         """Release the kernel and its arrays."""
         self._kernel = None

@@ -12,6 +12,7 @@ from sdc_taichi.hall.protection import TRIPPED
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums
+from sdc_taichi.sim.junction_parts import JunctionParts, junction_parts
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult, LiquidState
 from sdc_taichi.sim.room_dew_point import RoomDewPoint
 from sdc_taichi.sim.step_inputs import Commands, Surroundings
@@ -185,6 +186,18 @@ class LiquidHalls:
         more_w[self._racks] = step.server_w
         power_w += np.repeat(more_w, per_rack.astype(np.int64))
 
+    def junction_parts(self, dc: int, rack: int | None) -> JunctionParts:
+        """Split the junction of a rack of a data center after the last step.
+
+        Args:
+            dc: Index of the data center.
+            rack: Index of the rack in its hall; None is that of the hottest junction.
+        """
+        (of_dc,) = np.nonzero(self._dc == dc)
+        in_hall = self._racks[of_dc] - self._fleet.rack_offsets[dc]
+        indices = dict(zip(in_hall.tolist(), of_dc.tolist(), strict=True))
+        return junction_parts(self._model, indices, rack)
+
     def close(self) -> None:
         """Release the kernel arrays."""
         self._model.close()
@@ -210,6 +223,9 @@ class LiquidHalls:
             name: getattr(result, name) for name in _NAMES[DATA_CENTERS] if name in _OF_RESULT
         }
         values |= {name: getattr(result, name) for name in _NAMES[CDUS]}
+        water_m3s = result.cdu_valve * self._model.sizing.cdu_water_m3s
+        for name, flow_m3s in (("coolant_m3s", result.cdu_flow_m3s), ("facility_m3s", water_m3s)):
+            values[name] = np.bincount(self._fleet.cdu_dc, flow_m3s, self._fleet.size)
         it_w, liquid_w, lost = result.it_w, result.liquid_w, result.lost_utilisation
         if share is not None:
             of_axis = {DATA_CENTERS: share, CDUS: share[self._fleet.cdu_dc]}

@@ -23,6 +23,7 @@ from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
+from sdc_taichi.sim.junction_parts import JunctionParts
 from sdc_taichi.sim.liquid_halls import LiquidStep, no_liquid_state, with_leaks, without_liquid
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
@@ -388,6 +389,22 @@ class Simulator:
         """
         stages = self._started()
         return stages.hall.intake_air(stages.crac_units.coldest_supply_c(self.state.setpoint_c))
+
+    def junction_parts(self, rack: int | None = None, dc: int = 0) -> JunctionParts:
+        """Split the junction temperature of a liquid-cooled rack at the end of the last step.
+
+        Args:
+            rack: Index of the rack in its data center; None is that of the hottest junction.
+            dc: Index of the data center.
+
+        Raises:
+            RuntimeStateError: No step has been done.
+            SdcError: The rack is not liquid-cooled.
+        """
+        stages = self._started()
+        if stages.liquid is None:
+            raise ConfigError(f"{self.fleet.names[dc]}: no rack is liquid-cooled")
+        return stages.liquid.junction_parts(dc, rack)
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
         """Return a state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.

@@ -1,0 +1,110 @@
+"""Section of a report about the liquid-cooled racks of a data center."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from sdc_taichi.config.liquid_schema import W_CLASS_LIMITS_C, WARMEST_CLASS, water_class
+from sdc_taichi.run.folder_reader import RunFolder
+from sdc_taichi.types import F64
+
+from . import liquid_figures, rack_maps
+from .liquid_loop import LOOP_FIELDS, junction_limits_c
+from .plotting import format_number
+from .report_html import DASH, Block, key_figures, paragraph, picture, time_text
+from .report_pictures import ShownDataCenter
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def liquid_section(run: RunFolder, dc: ShownDataCenter) -> list[Block]:
+    """Return the section of liquid-cooled racks: key figures, classes of water and pictures.
+
+    Args:
+        run: the run.
+        dc: the data center, which has liquid-cooled racks.
+    """
+    liquid, limits_c = dc.config.liquid, junction_limits_c(dc.config)
+    assert liquid is not None
+    assert limits_c is not None
+    name, steps, step_h = run.names[dc.index], dc.steps, float(run.metrics["step_h"])
+    at = steps.iloc[int(steps["junction_max_c"].to_numpy().argmax())]
+    hottest = (
+        f"hottest junction, {at['junction_max_c']:.1f} °C on "
+        f"{time_text(run, at['time'].to_pydatetime())}"
+    )
+    blocks = [
+        key_figures(_figures(steps, step_h).items()),
+        paragraph(_water_classes(steps["facility_supply_c"].to_numpy(), step_h)),
+        picture(
+            liquid_figures.loop_diagram({field: float(at[field]) for field in LOOP_FIELDS}, liquid),
+            f"Diagram of the coolant loops of {name} at its {hottest}: coolant from "
+            f"{at['cdu_supply_c']:.1f} to {at['cdu_return_c']:.1f} °C, facility water from "
+            f"{at['facility_supply_c']:.1f} to {at['facility_return_c']:.1f} °C.",
+            f"The loops in the step of the {hottest}.",
+        ),
+        picture(
+            rack_maps.junction_map(dc.racks["junction_c"].to_numpy(), dc.config.hall, limits_c),
+            f"Map of the racks of {name} by junction temperature at its {hottest}.",
+            f"Junction of each liquid-cooled rack in the step of the {hottest}. Grey racks are "
+            "cooled by air. Row 0 is on top.",
+        ),
+    ]
+    if len(steps) < 2:
+        return [*blocks, paragraph("A single step has no history.")]
+    history = picture(
+        liquid_figures.loop_history(steps, limits_c[0], name),
+        f"Temperatures of coolant, facility water and junctions of {name} over the run, where the "
+        "heat of its liquid-cooled racks went, and the power of pumps, fans and chillers.",
+        f"The loops over the run. The dotted line is {limits_c[0]:g} °C, at which GPUs throttle. "
+        "Heat below zero left storage in chips and loops.",
+    )
+    return [*blocks, history]
+
+
+def _figures(steps: pd.DataFrame, step_h: float) -> dict[str, str]:
+    """Return the key figures of liquid cooling over a run, by label.
+
+    Args:
+        steps: steps of the data center.
+        step_h: length of a step, in h.
+    """
+    columns = ("it_w", "overhead_w", "it_fan_w", "reuse_w", "liquid_heat_w")
+    it_kwh, overhead_kwh, fan_kwh, reuse_kwh, liquid_kwh = (
+        float(steps[name].sum()) * step_h / 1e3 for name in columns
+    )
+    facility_kwh = it_kwh + overhead_kwh
+    ratios = {
+        "ERF, heat reused": (reuse_kwh, facility_kwh, ""),
+        "ERE": (facility_kwh - reuse_kwh, it_kwh, ""),
+        "TUE": (facility_kwh, it_kwh - fan_kwh, ""),
+        "WUE": (float(steps["water_l"].sum()), it_kwh, " L/kWh"),
+        "IT heat into coolant": (100 * liquid_kwh, it_kwh, " %"),
+    }
+    texts = {
+        label: f"{format_number(part / whole)}{unit}" if whole > 0 else DASH
+        for label, (part, whole, unit) in ratios.items()
+    }
+    throttled = format_number(float(steps["throttled_tasks"].sum()))
+    return {**texts, "throttled work": f"{throttled} tasks"}
+
+
+def _water_classes(facility_c: F64, step_h: float) -> str:
+    """Return a sentence about the hours by ASHRAE class of the facility water.
+
+    Args:
+        facility_c: temperature of the facility water in each step, in C, (T,).
+        step_h: length of a step, in h.
+    """
+    steps = Counter(map(water_class, facility_c.tolist()))
+    hours = ", ".join(
+        f"{name} for {format_number(steps[name] * step_h)} h"
+        for name in (*W_CLASS_LIMITS_C, WARMEST_CLASS)
+        if name in steps
+    )
+    return (
+        f"The facility water had {facility_c.min():.1f} to {facility_c.max():.1f} °C: ASHRAE class "
+        f"{hours}."
+    )
