@@ -752,7 +752,7 @@ def options_of_environment(rng: Generator, form: str) -> dict[str, Any]:
             options["agents"] = [x for x in groups if rng.random() < 0.6] or ["cdu"]
             others = pick(rng, ("idle", "liquid=liquid-reset", "liquid=liquid-wet-bulb"))
             options |= {"rewards": pick(rng, ("default", "bill")), "others": others}
-            if set(options["agents"]) == set(groups):
+            if {"cdu", "power_cap"} <= set(options["agents"]):
                 options["others"] = "idle"
             of_plant = {"plant": ["facility_approach_k", "reuse_share"]}
             commands = of_plant if "plant" in options["agents"] else {}
