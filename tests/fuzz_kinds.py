@@ -686,7 +686,7 @@ def saved_states(rng: Generator, folder: Path) -> Case:
 FORMS = ("parallel", "aec", "single", "joint", "make_vec", "vector")
 IDS = {"agent_ls": "Load", "agent_dc": "Cooling", "agent_bat": "Battery"}
 BATCH = 3
-LARGE_HALLS = ("hall_agents_16", "hall_agents_64")
+LARGE_HALLS = ("frontier_like", "hall_agents_16", "hall_agents_64")
 """Presets that differ from ``hall_agents_6`` in size alone."""
 ACTIONS: dict[str, Callable[[Generator, gymnasium.Space[Any], tuple[int, ...], Any], Any]] = {
     "random": lambda rng, space, shape, valid: valid,

@@ -11,6 +11,8 @@ from ledgers import LEDGERS, TRANSIENT_LEDGERS, Run, quantities, residual, stock
 from sdc_taichi import Actions, ConfigError, DataCenterConfig, SdcError, Simulator, load_config
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.config.loading import config_from_dict
+from sdc_taichi.errors import OddInputWarning
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 from simulated import assert_same, part_of
@@ -105,6 +107,7 @@ def recorded(configs: list[DataCenterConfig], steps: int) -> Run:
         return Run(values, start, sim.fleet.values, air, sim.step_h, counted, no_flows, battery_kwh)
 
 
+@pytest.mark.filterwarnings("ignore::sdc_taichi.errors.OddInputWarning")
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
 def test_every_balance_closes_in_every_step(thermal: str) -> None:
     rng = np.random.default_rng(11)
@@ -119,6 +122,7 @@ def test_every_balance_closes_in_every_step(thermal: str) -> None:
     assert (run["liquid_stored_w"] != 0.0).any() == (thermal == "transient")
 
 
+@pytest.mark.filterwarnings("ignore::sdc_taichi.errors.OddInputWarning")
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
 def test_a_data_center_is_the_same_alone_in_a_batch_and_after_a_snapshot(thermal: str) -> None:
     rng = np.random.default_rng(5)
@@ -245,6 +249,25 @@ def test_what_cannot_be_is_refused_in_one_line(overrides: list[str], message: st
     with pytest.raises(ConfigError, match=message) as caught:
         apply_overrides(liquid_hall(), overrides)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["liquid.cdus.capacity_kw=500"], "1 CDUs for 689.9 kW .* they need 689.9 kW each"),
+        (["liquid.dew_point_c=24", "liquid.setpoint_c=22"], "keeps the coolant at 26 C or above"),
+        (["liquid.reuse.kind=heat_pump", "liquid.reuse.network_supply_c=110"], "74 K above the"),
+        (["liquid.reuse.kind=direct", "liquid.reuse.network_return_c=60"], "so it gives no heat"),
+        (["liquid.reuse={kind: direct, price_per_kwh_heat: -0.1}"], "pays for the heat"),
+        (["hall.rack_types.gpu.liquid.gpu_idle_w=900"], "power caps below 0.75 have no effect"),
+        (["liquid.facility.w_class=W17"], "W17: the dry cooler gives water of .* design day"),
+    ],
+)
+def test_what_is_probably_a_mistake_warns(overrides: list[str], message: str) -> None:
+    runtime.ensure_started()
+    config = apply_overrides(liquid_hall(), overrides)
+    with pytest.warns(OddInputWarning, match=message), Simulator(config) as sim:
+        sim.reset()
 
 
 def test_a_section_without_liquid_racks_is_refused() -> None:

@@ -181,8 +181,8 @@ def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_lim
 
 @pytest.mark.parametrize("preset", preset_names())
 def test_every_preset_has_an_optimum(preset: str) -> None:
-    if preset == "large":
-        pytest.skip("of the same models as corrected")
+    if preset in ("large", "frontier_like"):
+        pytest.skip("of the same models as corrected or ai_hall_2026")
     if preset.startswith("hall_agents"):
         with pytest.raises(ConfigError, match="zone_loads: plans need the work of a trace"):
             solved(config_of("CA", preset=preset), steps=24)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from sdc_taichi.config.liquid_schema import POWER_CAP_LIMITS, W_CLASS_LIMITS_C
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.plant.plants import PLANTS
@@ -29,6 +30,13 @@ LEAST_USUAL_PUMP_EFFICIENCY = 0.2
 LEAST_USUAL_GRID_RATIO = 0.5
 """Smallest usual grid limit divided by the design power of the facility; a smaller limit would be
 exceeded in most hours."""
+
+
+MOST_USUAL_LIFT_K = 60.0
+"""Largest usual difference of the temperatures between which a heat pump of one stage works, in
+K."""
+TOWER_APPROACH_K = 4.0
+"""Water of a tower minus wet bulb at its design point, in K."""
 
 
 def odd_values(config: DataCenterConfig) -> Iterator[str]:
@@ -68,6 +76,82 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             f"electrical.grid_limit_ratio {ratio:g}: less than half of the design power overloads "
             "the connection in most hours"
         )
+    yield from _odd_liquid(config)
+
+
+def _odd_liquid(config: DataCenterConfig) -> Iterator[str]:
+    """Yield messages about unusual values of liquid cooling."""
+    liquid = config.liquid
+    if liquid is None:
+        return
+    cdus, reuse, racks = liquid.cdus, liquid.reuse, config.liquid_racks()
+    needed = cdus.manifolds * (cdus.per_manifold - cdus.spare)
+    design_kw = sum(rack.design_liquid_w for rack in racks.values()) / 1e3
+    if cdus.capacity_kw is not None and cdus.capacity_kw * needed < design_kw:
+        yield (
+            f"liquid.cdus.capacity_kw {cdus.capacity_kw:g}: {needed} CDUs for {design_kw:.4g} kW "
+            f"of liquid-cooled racks; without spare ones they need {design_kw / needed:.4g} kW each"
+        )
+    if liquid.dew_point_c is not None:
+        least_c = liquid.dew_point_c + liquid.dew_margin_k
+        if liquid.setpoint_c < least_c:
+            yield (
+                f"liquid.setpoint_c {liquid.setpoint_c:g}: the dew point of the room keeps the "
+                f"coolant at {least_c:g} C or above"
+            )
+    source_c = liquid.setpoint_c - cdus.approach_k
+    lift_k = reuse.network_supply_c - source_c
+    if reuse.kind == "heat_pump" and lift_k > MOST_USUAL_LIFT_K:
+        yield (
+            f"liquid.reuse.network_supply_c {reuse.network_supply_c:g}: {lift_k:.3g} K above the "
+            f"facility water; heat pumps of one stage lift by up to {MOST_USUAL_LIFT_K:g} K"
+        )
+    if reuse.kind == "direct" and reuse.network_return_c >= source_c + cdus.range_k:
+        yield (
+            f"liquid.reuse.network_return_c {reuse.network_return_c:g}: the facility water returns "
+            f"at about {source_c + cdus.range_k:g} C, so it gives no heat"
+        )
+    if reuse.price_per_kwh_heat < 0.0 and reuse.kind != "none":
+        yield (
+            f"liquid.reuse.price_per_kwh_heat {reuse.price_per_kwh_heat:g}: the data center pays "
+            "for the heat that it delivers"
+        )
+    for rack in dict.fromkeys(racks.values()):
+        least_w = POWER_CAP_LIMITS[0] * rack.gpu_max_w
+        if rack.gpu_idle_w > least_w:
+            yield (
+                f"gpu_idle_w {rack.gpu_idle_w:g}: power caps below "
+                f"{rack.gpu_idle_w / rack.gpu_max_w:.2g} have no effect, since idle GPUs draw more"
+            )
+        if liquid.setpoint_c >= rack.throttle_c:
+            yield f"liquid.setpoint_c {liquid.setpoint_c:g}: GPUs throttle at {rack.throttle_c:g} C"
+
+
+def odd_w_class(config: DataCenterConfig, outdoor_c: float, wet_bulb_c: float) -> str | None:
+    """Return a message if the facility water exceeds its W class on the design day, else None.
+
+    Args:
+        config: The data center.
+        outdoor_c: Design dry bulb, in C.
+        wet_bulb_c: Design wet bulb, in C.
+    """
+    liquid = config.liquid
+    if liquid is None or liquid.facility.w_class not in W_CLASS_LIMITS_C:
+        return None
+    facility, most_c = liquid.facility, W_CLASS_LIMITS_C[str(liquid.facility.w_class)]
+    air_c = outdoor_c
+    if facility.rejection == "tower":
+        air_c = wet_bulb_c + TOWER_APPROACH_K
+    elif facility.rejection == "adiabatic":
+        air_c -= facility.adiabatic_effectiveness * (outdoor_c - wet_bulb_c)
+    reached_c = air_c + facility.approach_k
+    if reached_c <= most_c or facility.trim_kw > 0.0:
+        return None
+    return (
+        f"liquid.facility.w_class {facility.w_class}: the {facility.rejection} cooler gives water "
+        f"of {reached_c:.1f} C on the design day; valid for the class are up to {most_c:g} C, so "
+        "it needs trim_kw or another cooler"
+    )
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
@@ -80,7 +164,8 @@ def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
     messages: list[tuple[str, list[str]]] = []
     for config in configs:
         # Copies of a data center share section objects, so each section is checked only once.
-        sections = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
+        parts = config.hall, config.servers, config.hvac, config.electrical, config.liquid
+        sections = tuple(map(id, parts))
         sections += (config.simulation.thermal == "transient",)
         if sections not in texts_of:
             texts_of[sections] = [*odd_values(config)]

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import OddInputWarning
+from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.events import schedule
@@ -79,6 +79,11 @@ class CommandedHalls:
         precision: Precision = "f64",
         fans: Literal["controlled", "follow_servers"] = "controlled",
     ) -> None:
+        if config.liquid is not None:
+            raise ConfigError(
+                f"{config.name}: halls with liquid-cooled racks have no known best commands; "
+                "valid is a hall without section liquid"
+            )
         self.copies = copies
         """Number n of copies."""
         self._follows = fans == "follow_servers"

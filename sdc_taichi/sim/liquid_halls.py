@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.config.odd_values import odd_w_class, warn_of
 from sdc_taichi.hall.protection import TRIPPED
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
@@ -15,6 +16,7 @@ from sdc_taichi.sim.hall_solver import Hall, HallSums
 from sdc_taichi.sim.junction_parts import JunctionParts, junction_parts
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult, LiquidState
 from sdc_taichi.sim.room_dew_point import RoomDewPoint
+from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.work_allocation import Placement
 from sdc_taichi.types import (
@@ -80,9 +82,13 @@ class LiquidHalls:
         fleet: B data centers with L liquid-cooled racks.
         hall: Halls of these data centers, whose sizes are known: the heat that liquid-cooled racks
             give to their air is an input from now on.
+        sizing: Their sized devices, with the design weather.
+
+    Warns:
+        OddInputWarning: A cooler does not reach its W class on the design day.
     """
 
-    def __init__(self, fleet: Fleet, hall: Hall) -> None:
+    def __init__(self, fleet: Fleet, hall: Hall, sizing: Sizing) -> None:
         assert fleet.liquid is not None
         self._fleet, self._hall, self._transient = (
             fleet,
@@ -105,6 +111,9 @@ class LiquidHalls:
             [s.cdus.pump_share if s.cdus.pumps > 1 else 0.0 for s in sections if s is not None]
         ).repeat(np.diff(fleet.cdu_offsets)[[s is not None for s in sections]])
         hall.take_heat_of(self._racks)
+        weather = zip(fleet.configs, sizing.design_outdoor_c, sizing.design_wet_bulb_c, strict=True)
+        odd = [(c.name, odd_w_class(c, float(dry), float(wet))) for c, dry, wet in weather]
+        warn_of([(name, [text]) for name, text in odd if text is not None])
 
     def initial(self, surroundings_c: tuple[F64, F64], load: F64) -> dict[str, F64]:
         """Return the fields of ``State`` before the first step.

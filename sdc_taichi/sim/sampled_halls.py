@@ -78,6 +78,8 @@ def sampled_fleet(fleet: Fleet, dcs: I64, modes: Mapping[int, SteadyModes]) -> F
         server_offsets=offsets_from_counts(
             np.concatenate([of_hall[0] for of_hall in group_rows]), "servers of sampled racks"
         ),
+        # Sampled racks start other racks at the heat of their design point.
+        liquid_racks=fleet.liquid_racks[:0],
         approach_k=fleet.approach_k[racks],
         group_rows=group_rows,
         dcs=fleet.dcs[:, dcs],

@@ -112,7 +112,7 @@ def make_stages(
     hall, units = Hall(fleet, precision), UnitIndex(fleet)
     sizing = size(fleet, hall, drivers.design_outdoor_c, drivers.design_wet_bulb_c)
     hall.discard_last_step()
-    liquid = None if fleet.liquid is None else LiquidHalls(fleet, hall)
+    liquid = None if fleet.liquid is None else LiquidHalls(fleet, hall, sizing)
     allocation = WorkAllocation(fleet)
     models = Facility(fleet, sizing, event_free=event_free)
     facility = FacilityStage(fleet, models)
