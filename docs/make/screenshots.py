@@ -5,8 +5,9 @@
 Two of six CRAC units go down one after the other on a July day. FOLDER/rerun_failure.webp shows the
 viewer while both are down, FOLDER/rerun_hot_spot.webp the heat map before, during and after.
 FOLDER/rerun_airflow.webp shows the airflow of a mixed hall and FOLDER/rerun_zones.webp the zones of
-102,400 racks, each while a CRAC unit is down. The viewer needs a Vulkan driver; one that computes
-on the CPU is enough (Debian: mesa-vulkan-drivers).
+102,400 racks, each while a CRAC unit is down; FOLDER/rerun_liquid.webp shows liquid-cooled racks
+while facility pumps have failed. The viewer needs a Vulkan driver; one that computes on the CPU is
+enough (Debian: mesa-vulkan-drivers).
 """
 
 from __future__ import annotations
@@ -59,6 +60,20 @@ LARGE_HALL = (
     "servers.power_w=[4000, 400]",
     "hvac.crac.units=40",
     UNIT_DOWN.format(9),
+)
+LIQUID_HALL = (
+    "name=hall",
+    "site.start=07-01",
+    "hall.rows=4",
+    "hall.racks_per_row=5",
+    "hall.supply_approach_k=5",
+    "hall.return_approach_k=-3",
+    "hall.rack_types={gpu: {model: gb200_nvl72}, web: {servers: {count: 18, full_w: 600, "
+    "idle_w: 170, design_rise_k: 13}}}",
+    "hall.rack_plan=[{type: web, rows: '0, 3'}, {type: gpu, rows: 1-2}]",
+    "hvac.sizing.model=design_day",
+    "liquid={cdus: {manifolds: 2}, reuse: {kind: heat_pump, share: 0.5}}",
+    "events.scheduled=[{kind: facility_pump_down, share: 0.35, start_h: 14, duration_h: 4}]",
 )
 MIXED_HALL = ("name=hall", "site.start=07-01", UNIT_DOWN.format(2))
 DAY = 96
@@ -244,7 +259,7 @@ def draw_failure(recording: Path) -> dict[str, Image.Image]:
 
 
 def draw_tabs(recording: Path, *tabs: str) -> Image.Image:
-    """Screenshot of tabs of a recording while a CRAC unit of its hall is down."""
+    """Screenshot of tabs of a recording while devices of its hall are down."""
     with native_viewer(recording) as viewer:
         open_tabs(viewer, *tabs)
         time.sleep(GREETING_S)
@@ -258,6 +273,7 @@ def main(folder: Path) -> None:
         pictures = draw_failure(recording)
         for name, preset, values, steps, tabs in (
             ("airflow", "hall_of_2026", MIXED_HALL, DAY, ["airflow"]),
+            ("liquid", "corrected", LIQUID_HALL, DAY, ["liquid", "junction"]),
             ("zones", "large", LARGE_HALL, LARGE_HALL_STEPS, ["zones", "zone 5"]),
         ):
             recording = Path(scratch) / f"{name}.rrd"
