@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,8 +14,12 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import sdc_taichi
+from policies import policy
 from sdc_taichi import Actions, ConfigError, load_config, make_controller
+from sdc_taichi.control import commands_of
 from sdc_taichi.envs.agents import TEAM_OF_LIQUID
+from sdc_taichi.envs.options import make_options
+from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.optimum.loop_map import LoopCommands
 from sdc_taichi.optimum.loop_optimum import loop_optimum
 from sdc_taichi.optimum.objective import Objective, Score
@@ -22,6 +27,7 @@ from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 
 HALL_ENV: Any = sdc_taichi.hall_env
 VECTOR_ENV: Any = sdc_taichi.vector_env
@@ -228,6 +234,22 @@ def test_a_subset_learns_and_controllers_do_the_rest() -> None:
     for _ in range(3):
         env.step(zeros(env))
     assert (env.core.view.state.cdu_setpoint_c != 40.0).all()
+
+
+def test_a_policy_of_all_cdus_controls_halls_with_other_numbers(tmp_path: Path) -> None:
+    commands = {"plant": ("facility_approach_k", "reuse_share")}
+    agents = ("plant", "cdu", "power_cap")
+    options = make_options(agents=agents, actions="continuous", commands=commands)
+    policy(interface_of(build_fleet(HALL), options)).save(tmp_path)
+    with Simulator(hall(manifolds=1)) as sim:
+        controller = make_controller(f"liquid=policy:{tmp_path}", sim.fleet)
+        assert set(commands_of(controller)) == set(LIQUID_COMMANDS)
+        sim.reset(0)
+        view = sdc_taichi.control.view_maker(sim)(None)
+        controller.reset(0)
+        flow: Any = controller.act(view).cdu_flow
+        assert flow.shape == (2,)
+    assert interface_of(build_fleet(HALL), options, ("cdu",)).policies_of("cdu")[3:] == ("cdu_3",)
 
 
 def test_rules_command_by_wet_bulb_and_by_headroom() -> None:
