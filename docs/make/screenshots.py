@@ -64,15 +64,6 @@ LARGE_HALL = (
 LIQUID_HALL = (
     "name=hall",
     "site.start=07-01",
-    "hall.rows=4",
-    "hall.racks_per_row=5",
-    "hall.supply_approach_k=5",
-    "hall.return_approach_k=-3",
-    "hall.rack_types={gpu: {model: gb200_nvl72}, web: {servers: {count: 18, full_w: 600, "
-    "idle_w: 170, design_rise_k: 13}}}",
-    "hall.rack_plan=[{type: web, rows: '0, 3'}, {type: gpu, rows: 1-2}]",
-    "hvac.sizing.model=design_day",
-    "liquid={cdus: {manifolds: 2}, reuse: {kind: heat_pump, share: 0.5}}",
     "events.scheduled=[{kind: facility_pump_down, share: 0.35, start_h: 14, duration_h: 4}]",
 )
 MIXED_HALL = ("name=hall", "site.start=07-01", UNIT_DOWN.format(2))
@@ -273,7 +264,7 @@ def main(folder: Path) -> None:
         pictures = draw_failure(recording)
         for name, preset, values, steps, tabs in (
             ("airflow", "hall_of_2026", MIXED_HALL, DAY, ["airflow"]),
-            ("liquid", "corrected", LIQUID_HALL, DAY, ["liquid", "junction"]),
+            ("liquid", "ai_hall_2026", LIQUID_HALL, DAY, ["liquid", "junction"]),
             ("zones", "large", LARGE_HALL, LARGE_HALL_STEPS, ["zones", "zone 5"]),
         ):
             recording = Path(scratch) / f"{name}.rrd"
