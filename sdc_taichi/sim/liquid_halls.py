@@ -35,10 +35,14 @@ STATE_FIELDS = tuple(f.name for f in fields(LiquidState))
 """Fields of ``State`` that liquid cooling needs."""
 _STEADY_FIELDS = ("cdu_setpoint_c", "cdu_flow")
 """Fields of ``State`` that liquid cooling of quasi-steady halls needs."""
+_NO_STATE = dict.fromkeys(STATE_FIELDS, np.zeros(0))
 _NAMES = {
     axis: tuple(f.name for f in fields(LiquidQuantities) if QUANTITIES[f.name].axis == axis)
     for axis in (DATA_CENTERS, CDUS, RACKS)
 }
+_ALL_NAMES = (*_NAMES[DATA_CENTERS], *_NAMES[CDUS], *_NAMES[RACKS])
+_TIMES = slice(_NAMES[DATA_CENTERS].index("throttle_s"), _NAMES[DATA_CENTERS].index("trip_s") + 1)
+"""Rows of the quantities of data centers that are times."""
 _OF_RESULT = {f.name for f in fields(LiquidResult)}
 _DEVICES = ("cdu_pump", "facility_pump", "cooler_fan", "trim_chiller", "heat_pump")
 """Devices of liquid cooling with electric power."""
@@ -342,19 +346,17 @@ def without_liquid(fleet: Fleet) -> dict[str, Any]:
     Args:
         fleet: The data centers.
     """
-    sizes = {DATA_CENTERS: fleet.size, CDUS: fleet.cdus, RACKS: fleet.racks}
-    values: dict[str, Any] = {}
-    for axis, names in _NAMES.items():
-        values.update(zip(names, np.zeros((len(names), sizes[axis])), strict=True))
+    rows = np.zeros((len(_NAMES[DATA_CENTERS]), fleet.size))
     # These times are -1 in steps in which nothing happens.
-    values["throttle_s"] -= 1.0
-    values["trip_s"] -= 1.0
-    return values
+    rows[_TIMES] = -1.0
+    per_cdu = np.zeros((len(_NAMES[CDUS]), fleet.cdus))
+    per_rack = np.zeros((len(_NAMES[RACKS]), fleet.racks))
+    return dict(zip(_ALL_NAMES, (*rows, *per_cdu, *per_rack), strict=True))
 
 
 def no_liquid_state() -> dict[str, F64]:
     """Return the fields of ``State`` that liquid cooling needs, empty, by name."""
-    return dict.fromkeys(STATE_FIELDS, np.zeros(0))
+    return _NO_STATE
 
 
 def _of_all(chosen: Mask, racks: npt.NDArray[np.integer], count: int) -> Mask:

@@ -234,7 +234,8 @@ class ActionDecoder:
     def _liquid_commands(self, wanted: Actions) -> dict[str, F64 | None]:
         """Return the commands for liquid cooling by their fields of ``Commands``, after a check."""
         actions = _liquid_actions(wanted)
-        if all(action is None for action in actions):
+        setpoint_c, flow, approach_k, share, cap = actions
+        if setpoint_c is flow is approach_k is share is cap is None:
             return _HELD_LIQUID
         commands = dict(_HELD_LIQUID)
         for (name, (field, (low, high))), action in zip(
