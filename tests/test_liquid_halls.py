@@ -53,10 +53,18 @@ def liquid_hall(name: str = "a", **sections: Any) -> DataCenterConfig:
     return config_from_dict(values, name)
 
 
+def with_doors(effectiveness: float = 0.6) -> dict[str, Any]:
+    """Values of section ``hall`` in which the air-cooled racks have rear doors."""
+    types: dict[str, Any] = HALL["rack_types"]
+    web = types["web"] | {"rear_door": {"effectiveness": effectiveness}}
+    return {"rack_types": types | {"web": web}}
+
+
 def random_hall(rng: np.random.Generator, name: str, thermal: str) -> DataCenterConfig:
     kind = str(rng.choice(["none", "direct", "heat_pump"]))
     return liquid_hall(
         name,
+        hall=with_doors(float(rng.uniform(0.1, 1.0))) if rng.integers(2) else {},
         simulation={"thermal": thermal},
         site={"location": str(rng.choice(["AZ", "NY", "WA"])), "start": "07-01"},
         workload={"placement": "uniform", "max_utilisation": 1.0},
@@ -175,6 +183,26 @@ def test_a_rack_trips_without_coolant_and_restarts_once_it_flows_again() -> None
     assert not liquid[-1].any()
 
 
+def test_rear_doors_take_more_heat_from_the_air_the_colder_their_coolant() -> None:
+    plain = liquid_hall("plain", liquid={"setpoint_c": 22})
+    doors = [
+        liquid_hall(f"at {setpoint_c}", hall=with_doors(), liquid={"setpoint_c": setpoint_c})
+        for setpoint_c in (22, 30)
+    ]
+    sim = Simulator([plain, *doors])
+    sim.reset()
+    step = sim.step()
+    web = np.array([rack % 6 > 2 for rack in range(12)] * 3).reshape(3, -1)
+    taken_w = step.rack_liquid_w.reshape(3, -1)
+    power_w = step.rack_cpu_w.reshape(3, -1)
+    assert not taken_w[0][web[0]].any()
+    for dc, coolant_c in ((1, 22.0), (2, 30.0)):
+        # Effectiveness (1 + (room - coolant) / design rise), the room at 27 C.
+        share = 0.6 * (1.0 + (27.0 - coolant_c) / 13.0)
+        np.testing.assert_allclose(taken_w[dc][web[dc]], share * power_w[dc][web[dc]], rtol=1e-6)
+    assert step.cooling_load_w[1] < step.cooling_load_w[2] < step.cooling_load_w[0]
+
+
 def test_work_of_limited_gpus_waits_in_the_queue() -> None:
     config = liquid_hall(workload={"flexible_share": 0.0, "queue_limit_h": 0.2})
     powers = ["gpu_idle_w=450", "gpu_max_w=1000"]
@@ -268,6 +296,12 @@ def test_what_is_probably_a_mistake_warns(overrides: list[str], message: str) ->
     config = apply_overrides(liquid_hall(), overrides)
     with pytest.warns(OddInputWarning, match=message), Simulator(config) as sim:
         sim.reset()
+
+
+def test_a_rear_door_stands_behind_servers_in_air() -> None:
+    gpu = HALL["rack_types"]["gpu"] | {"rear_door": {}}
+    with pytest.raises(ConfigError, match="rear_door with liquid: valid is a rear_door behind"):
+        liquid_hall(hall={"rack_types": HALL["rack_types"] | {"gpu": gpu}})
 
 
 def test_a_section_without_liquid_racks_is_refused() -> None:

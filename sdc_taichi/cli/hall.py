@@ -457,7 +457,7 @@ def _type_lines(design: DesignHall) -> list[str]:
         if not of_type.any():
             lines.append(f"  type {printable(name)}: no racks")
             continue
-        if (rack := hall.rack_types[name].liquid) is not None:
+        if (rack := hall.rack_types[name].liquid_rack) is not None:
             lines.append(
                 f"  type {printable(name)}: {count_text(int(of_type.sum()), 'rack')} of "
                 f"{rack.design_it_w / 1e3:,.1f} kW: {rack.design_liquid_w / 1e3:,.1f} kW into "

@@ -28,7 +28,7 @@ from sdc_taichi.config.fields import (
     WorkingShare,
     check_one_per_rack,
 )
-from sdc_taichi.config.liquid_schema import LiquidRack, with_model
+from sdc_taichi.config.liquid_schema import LiquidRack, RearDoor, with_model
 from sdc_taichi.errors import shortened, suggestion_or_valid
 from sdc_taichi.plant.servers import Knee, ServerCurves, curve_through, linear_curve
 
@@ -45,6 +45,13 @@ draw more power for their height are not heavier."""
 ROOM_J_PER_K_W = 15.0
 """Heat capacity of coils, water in the coils and raised floor, whose temperatures follow the supply
 air, divided by the servers' power at full load, in J/(K W)."""
+AIR_J_PER_M3_K = 1200.0
+"""Heat capacity of air at sea level, in J/(m3 K), for the airflow of servers with a rear door."""
+DOOR_RISE_K = 13.0
+"""Design rise of the air through servers with a rear door that give neither rise nor airflow, in
+K."""
+LEAST_SHARE_IN_AIR = 0.05
+"""Smallest share of the heat of servers with a rear door for which the air of the hall is sized."""
 MOST_RACK_U = 58.0
 """Height of the tallest racks, in units of 44.45 mm."""
 LEAST_INLET_RANGE_K = 5.0
@@ -230,6 +237,13 @@ class ServerGroup(Section):
         return self
 
 
+def _airflow_m3s(group: ServerGroup) -> float:
+    """Return the airflow of a server in front of a rear door at full load, in m3/s."""
+    if group.full_airflow_m3s is not None:
+        return group.full_airflow_m3s
+    return group.full_w / (AIR_J_PER_M3_K * (group.design_rise_k or DOOR_RISE_K))
+
+
 class RackType(Section):
     """Type of rack, defined by its servers in air, or by its liquid-cooled chips."""
 
@@ -240,6 +254,8 @@ class RackType(Section):
     """Server groups of an air-cooled rack, from the floor up."""
     liquid: LiquidRack | None = None
     """Chips and cold plates of a liquid-cooled rack, as an alternative to ``servers``."""
+    rear_door: RearDoor | None = None
+    """Heat exchanger behind the servers of an air-cooled rack; None without one."""
 
     @model_validator(mode="before")
     @classmethod
@@ -256,7 +272,21 @@ class RackType(Section):
         if (self.servers is None) == (self.liquid is None):
             number = "neither is" if self.servers is None else "both are"
             raise ValueError(f"servers and liquid: {number} given; valid is one of them")
+        if self.rear_door is not None and self.liquid is not None:
+            raise ValueError("rear_door with liquid: valid is a rear_door behind servers in air")
         return self
+
+    @property
+    def liquid_rack(self) -> LiquidRack | None:
+        """Rack as the coolant sees it; None for racks without coolant."""
+        if self.rear_door is None or self.servers is None:
+            return self.liquid
+        idle_w, full_w = (
+            sum(g.count * power for g, power in zip(self.servers, powers, strict=True))
+            for powers in zip(*((g.idle_w, g.full_w) for g in self.servers), strict=True)
+        )
+        airflow_m3s = sum(g.count * _airflow_m3s(g) for g in self.servers)
+        return self.rear_door.as_liquid(idle_w, full_w, full_w / (airflow_m3s * AIR_J_PER_M3_K))
 
     @property
     def air_servers(self) -> tuple[ServerGroup, ...]:
@@ -266,7 +296,20 @@ class RackType(Section):
         """
         if (rack := self.liquid) is None:
             assert self.servers is not None
-            return self.servers
+            if self.rear_door is None:
+                return self.servers
+            left = max(1.0 - self.rear_door.effectiveness, LEAST_SHARE_IN_AIR)
+            return tuple(
+                group.model_copy(
+                    update={
+                        "full_w": left * group.full_w,
+                        "idle_w": left * group.idle_w,
+                        "full_airflow_m3s": _airflow_m3s(group),
+                        "design_rise_k": None,
+                    }
+                )
+                for group in self.servers
+            )
         tray = ServerGroup(
             count=rack.trays,
             full_w=max(rack.air_w(1.0) / rack.trays, 1.0),

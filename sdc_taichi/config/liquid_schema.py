@@ -183,6 +183,50 @@ class LiquidRack(Section):
         return self
 
 
+class DoorRack(LiquidRack):
+    """Air-cooled rack with a rear door, as a rack without chips on cold plates."""
+
+    door_effectiveness: WorkingShare
+    """Share of the heat that the door takes with coolant at room temperature, 0.01..1."""
+
+
+class RearDoor(Section):
+    """Heat exchanger behind the servers of an air-cooled rack, with coolant from the CDUs.
+
+    The power of servers with a rear door depends on their load alone, not on the inlet temperature.
+    """
+
+    effectiveness: WorkingShare = 0.6
+    """Share of the heat of the servers that the door takes with coolant at ``liquid.room_c``,
+    0.01..1; assumed. Colder coolant takes more."""
+    lpm_per_kw: Annotated[float, Field(ge=0.1, le=10)] = 2.0
+    """Design flow of coolant divided by the heat that the door takes at full load, in l/min per
+    kW, 0.1..10; assumed."""
+    loss_w_per_k: Annotated[float, Field(ge=0, le=1e4)] = 10.0
+    """Heat that lines of the door lose to the room, in W per K of coolant temperature above the
+    room, 0..10,000; assumed."""
+
+    def as_liquid(self, idle_w: float, full_w: float, rise_k: float) -> LiquidRack:
+        """Return the rack as one without chips on cold plates.
+
+        Args:
+            idle_w: Power of its servers without work, in W.
+            full_w: Power of its servers at full load, in W.
+            rise_k: Temperature rise of the air through the rack at the design point, in K.
+        """
+        return DoorRack.model_construct(
+            gpus=0,
+            cpus=0,
+            other_idle_w=idle_w,
+            other_max_w=full_w,
+            capture_other=self.effectiveness,
+            lpm_per_kw=self.lpm_per_kw,
+            loss_w_per_k=self.loss_w_per_k,
+            air_rise_k=rise_k,
+            door_effectiveness=self.effectiveness,
+        )
+
+
 class CduConfig(Section):
     """Coolant distribution units: exchangers and pumps between racks and facility water."""
 

@@ -391,7 +391,9 @@ class DataCenterConfig(Section):
 
     @model_validator(mode="after")
     def _liquid_fits_the_racks(self) -> Self:
-        names = [name for name, kind in self.hall.rack_types.items() if kind.liquid is not None]
+        names = [
+            name for name, kind in self.hall.rack_types.items() if kind.liquid_rack is not None
+        ]
         racks = len(self.liquid_racks())
         if self.liquid is None:
             if racks:
@@ -557,9 +559,9 @@ class DataCenterConfig(Section):
     def liquid_racks(self) -> dict[int, LiquidRack]:
         """Return the liquid-cooled racks by their index in the hall."""
         types = self.hall.rack_types
-        if all(kind.liquid is None for kind in types.values()):
+        if all(kind.liquid_rack is None for kind in types.values()):
             return {}
-        kinds = {name: kind.liquid for name, kind in types.items()}
+        kinds = {name: kind.liquid_rack for name, kind in types.items()}
         of_racks = enumerate(kinds[name] for name in self.hall.rack_type_names())
         return {rack: liquid for rack, liquid in of_racks if liquid is not None}
 

@@ -120,7 +120,10 @@ def _rack_parameters(racks: Sequence[LiquidRack]) -> RackParameters:
     names = [f.name for f in fields(RackParameters) if f.name in LiquidRack.model_fields]
     values = {name: _array([getattr(rack, name) for rack in racks]) for name in names}
     return RackParameters(
-        **values, liquid_design_w=_array([rack.design_liquid_w for rack in racks])
+        **values,
+        liquid_design_w=_array([rack.design_liquid_w for rack in racks]),
+        door_effectiveness=_array([getattr(rack, "door_effectiveness", 0.0) for rack in racks]),
+        door_rise_k=_array([rack.air_rise_k for rack in racks]),
     )
 
 
