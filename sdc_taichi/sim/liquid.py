@@ -379,20 +379,18 @@ class Liquid:
 
     def _set_failures(self, inputs: LiquidInputs) -> None:
         """Write failures, and the substeps that they need."""
-        rows, given = (
-            self._inputs,
-            {
-                "up": inputs.cdu_up,
-                "pumps": inputs.cdu_pumps,
-                "facility_pump": inputs.facility_pump,
-                "cooler_share": inputs.cooler_share,
-            },
-        )
-        fails = inputs.rack_valve is not None or any(x is not None for x in given.values())
+        rows = self._inputs
+        failures = {
+            "up": inputs.cdu_up,
+            "pumps": inputs.cdu_pumps,
+            "facility_pump": inputs.facility_pump,
+            "cooler_share": inputs.cooler_share,
+        }
+        fails = inputs.rack_valve is not None or any(x is not None for x in failures.values())
         if not fails and not self._had_failures:
             return
         self._had_failures = fails
-        for name, values in given.items():
+        for name, values in failures.items():
             rows[name][:] = 1.0 if values is None else values
         substeps = rows["substeps"]
         substeps[:] = self._usual_substeps
@@ -479,12 +477,14 @@ class Liquid:
         _, dc = self._rows_out("dc", spec.DC_OUT)
         _, cdu = self._rows_out("cdu", spec.CDU_OUT)
         _, rack = self._rows_out("rack", spec.RACK_OUT)
-        zeros, states = np.zeros(self._size), self._arrays["dc_state"].copy()
+        states = self._arrays["dc_state"].copy()
         fan_w, evaporated_w = dc["cooler_fan_w"], dc["evaporated_w"]
         if self._has_towers:
             fan_w = np.where(self._is_tower, self._tower(inputs).fan_w, fan_w)
             evaporated_w = np.where(self._is_tower, np.maximum(dc["cooler_w"], 0.0), evaporated_w)
-        chiller_w = self._trim_chiller_w(dc, inputs) if self._trims else zeros
+        chiller_w = np.zeros(self._size)
+        if self._trims and dc["trim_load_w"].any():
+            chiller_w = self._trim_chiller_w(dc, inputs)
         reuse_w = dc["taken_w"] + dc["heat_pump_w"]
         return LiquidResult(
             liquid_it_w=dc["it_w"],
@@ -506,7 +506,7 @@ class Liquid:
             liquid_rejected_w=dc["cooler_w"] + dc["trim_load_w"] + chiller_w,
             liquid_stored_w=dc["stored_w"],
             cooler_water_l=evaporated_w * self._litres_per_w,
-            leak_l=zeros if inputs.leak_l is None else inputs.leak_l,
+            leak_l=np.zeros(self._size) if inputs.leak_l is None else inputs.leak_l,
             heat_income=self._income_per_w * reuse_w,
             throttle_s=dc["throttle_s"],
             trip_s=dc["trip_s"],

@@ -259,7 +259,7 @@ class LiquidHalls:
         while_on_w = np.divide(it_w - air_w, on, out=np.zeros(len(on)), where=on > 0.0)
         return LiquidStep(
             more_it_w=self._sums(it_w - air_w),
-            overhead_w=np.sum([values[f"{device}_w"] for device in _DEVICES], axis=0),
+            overhead_w=sum(values[f"{device}_w"] for device in _DEVICES),
             more_water_l=values["cooler_water_l"] + values["leak_l"],
             quantities=values
             | {
@@ -298,23 +298,23 @@ class LiquidHalls:
 
     def _failures(self, surroundings: Surroundings) -> dict[str, Any]:
         """Return the failures as arguments of ``LiquidInputs``."""
-        given: dict[str, Any] = {"leak_l": surroundings.leaked_l}
+        failures: dict[str, Any] = {"leak_l": surroundings.leaked_l}
         if surroundings.cdu_up is None and surroundings.fully_powered:
-            return given
+            return failures
         size, fleet = self._fleet.size, self._fleet
         on = (surroundings.powered > 0.0).astype(np.float64)
         ones = np.ones(size)
         up = np.ones(fleet.cdus) if surroundings.cdu_up is None else surroundings.cdu_up
-        given["cdu_up"] = up * on[fleet.cdu_dc]
+        failures["cdu_up"] = up * on[fleet.cdu_dc]
         pump = ones if surroundings.facility_pump is None else surroundings.facility_pump
-        given["facility_pump"] = pump * on
+        failures["facility_pump"] = pump * on
         fans = ones if surroundings.cooler_share is None else surroundings.cooler_share
-        given["cooler_share"] = fans * on
+        failures["cooler_share"] = fans * on
         if surroundings.cdu_pump_up is not None:
-            given["cdu_pumps"] = np.where(surroundings.cdu_pump_up > 0.0, 1.0, self._pump_share)
+            failures["cdu_pumps"] = np.where(surroundings.cdu_pump_up > 0.0, 1.0, self._pump_share)
         if surroundings.rack_leaks is not None and surroundings.rack_leaks.any():
-            given["rack_valve"] = np.where(surroundings.rack_leaks, 0.0, 1.0)
-        return given
+            failures["rack_valve"] = np.where(surroundings.rack_leaks, 0.0, 1.0)
+        return failures
 
     def _coolant_flows(self, surroundings: Surroundings) -> Mask:
         """Return True for liquid-cooled racks whose coolant can flow and be cooled, (L,)."""
