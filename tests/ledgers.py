@@ -156,8 +156,8 @@ LEDGERS: dict[str, Ledger] = {
         r["deferred_tasks"],
         -r["drained_tasks"],
         r["overdue_tasks"] - r["due_tasks"],
-        r["throttled_tasks"] - r["unplaced_tasks"],
         -r["queue_tasks"],
+        r["throttled_tasks"] - r["unplaced_tasks"],
     ],
     "battery": lambda r: [
         r.before("stored_kwh"),
@@ -243,3 +243,7 @@ def residual(terms: list[F64], floor: float = 0.0) -> F64:
     largest = np.max(np.abs(terms), axis=0)
     largest = np.maximum(largest, floor * largest.max(axis=0))
     return np.asarray(np.abs(total) / np.where(largest > 0, largest, 1.0))
+
+
+OF_LIQUID = {"queue": 1, "hvac": 5, "water": 2, "liquid": 9}
+"""Number of the last terms of each balance that only halls with liquid-cooled racks have."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reference_twin
-from ledgers import LEDGERS, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
+from ledgers import LEDGERS, OF_LIQUID, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
 from sdc_taichi import (
     Actions,
     DataCenterConfig,
@@ -336,7 +336,10 @@ def test_ledger_does_not_close_without_one_of_its_terms(
 
 
 def test_every_term_of_every_ledger_is_left_out_once(heat_wave: tuple[Precision, Run]) -> None:
-    assert {name: len(ledger(heat_wave[1])) for name, ledger in LEDGERS.items()} == LEFT_OUT
+    counts = {name: len(ledger(heat_wave[1])) for name, ledger in LEDGERS.items()}
+    # tests/test_liquid_halls.py leaves out the terms of liquid cooling.
+    of_air = {name: count - OF_LIQUID.get(name, 0) for name, count in counts.items()}
+    assert {name: count for name, count in of_air.items() if count} == LEFT_OUT
 
 
 def test_heat_wave_stores_heat_and_gives_it_back(heat_wave: tuple[Precision, Run]) -> None:

@@ -176,6 +176,7 @@ def test_agents_share_one_reward() -> None:
     assert values["power_cap"] == pytest.approx([0.4 * cap + 0.15 * 4 * own])
 
 
+@pytest.mark.filterwarnings("ignore::sdc_taichi.errors.OddInputWarning")
 def test_costs_of_liquid_cooling() -> None:
     costs = ["junction_headroom", "throttled_work", "dew_point"]
     with closing(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ledgers import LEDGERS, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
+from ledgers import LEDGERS, OF_LIQUID, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
 from sdc_taichi import Actions, ConfigError, DataCenterConfig, SdcError, Simulator, load_config
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.config.loading import config_from_dict
@@ -123,6 +123,13 @@ def test_every_balance_closes_in_every_step(thermal: str) -> None:
     for name in LEDGERS if thermal == "quasi_steady" else TRANSIENT_LEDGERS:
         worst = residual(LEDGERS[name](run), floor=1e-3).max()
         assert worst < 1e-9, (name, worst)
+    for name, count in OF_LIQUID.items():
+        terms = LEDGERS[name](run)
+        for i in range(len(terms) - count, len(terms)):
+            never = (name, i) == ("water", len(terms) - 1)  # No rack leaks here.
+            never |= thermal == "quasi_steady" and (name, i) == ("liquid", len(terms) - 1)
+            without = [term for k, term in enumerate(terms) if k != i]
+            assert never or residual(without, floor=1e-3).max() > 1e-6, (name, i)
     # The run reaches what the balances are for.
     for name in ("reuse_w", "heat_pump_w", "trim_load_w", "cooler_water_l", "throttled_tasks"):
         assert run[name].max() > 0.0, name

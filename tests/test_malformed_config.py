@@ -45,7 +45,7 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ("hall: {rows: 1}\nhall: {rows: 2}\n", ["'hall' is given twice", "line 2"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML", "single document"]),
         ("!!python/object:os.system {}", ["not valid YAML", "python/object"]),
-        ("extends: corected", ["extends: 'corected'", "corrected, fleet_of_eight, hall_agents_16"]),
+        ("extends: corected", ["extends: 'corected'", "corrected, fleet_of_eight, frontier_like"]),
         ("extends: ./other.yaml", ["extends: './other.yaml'", "is no file"]),
         ("extends: .", ["extends: '.'", "is no file", "valid is a preset"]),
         ("extends: [tiny]", ["extends: ['tiny'] is no name", "valid is a preset"]),

@@ -673,7 +673,7 @@ def test_halls_with_water_equal_themselves_alone_and_after_a_saved_state() -> No
         sim.load_state_dict(saved)
         assert sim.step().inlet_max_c[0] == expected
         old = {n: v for n, v in saved.items() if n != "tank_heat_j"} | {"version": np.array(3)}
-        with pytest.raises(SdcError, match="snapshot: version 3, expected 5"):
+        with pytest.raises(SdcError, match="snapshot: version 3, expected 6"):
             sim.load_state_dict(old)
 
 
