@@ -200,6 +200,18 @@ def _begin_step(liquid: ti.template(), dc):
         m += liquid.one
     of_dc = liquid.dcs[dc]
     of_dc.cdu_pump_w = 0.0
+    _clear_facility(liquid, dc)
+    of_dc.stored_w = 0.0
+    of_dc.throttle_s = -1.0
+    of_dc.trip_s = -1.0
+    of_dc.sweeps = 0.0
+
+
+@ti.func
+@no_type_check
+def _clear_facility(liquid: ti.template(), dc):
+    """Set powers and heat flows of the facility loop to 0."""
+    of_dc = liquid.dcs[dc]
     of_dc.facility_pump_w = 0.0
     of_dc.cooler_fan_w = 0.0
     of_dc.cooler_w = 0.0
@@ -207,10 +219,6 @@ def _begin_step(liquid: ti.template(), dc):
     of_dc.taken_w = 0.0
     of_dc.heat_pump_w = 0.0
     of_dc.evaporated_w = 0.0
-    of_dc.stored_w = 0.0
-    of_dc.throttle_s = -1.0
-    of_dc.trip_s = -1.0
-    of_dc.sweeps = 0.0
 
 
 @ti.func
@@ -490,7 +498,8 @@ def _set_valves(liquid: ti.template(), dc, m, most_open, water_c):
         liquid.cdus[c].is_full = 0.0
         c += liquid.one
     k_sum, water, passes = liquid.real(0.0), liquid.real(0.0), 0
-    # Where a valve of several is fully open, the others take over what is left.
+    # A CDU whose valve is fully open may give less heat to the facility water than its setpoint
+    # needs; the other CDUs of the manifold then give the rest.
     while passes < 3:
         return_c = _wanted_return_c(liquid, dc, m, water_c)
         k_sum, water, c = 0.0, 0.0, first
@@ -727,13 +736,7 @@ def _add_facility(
 def _settle_facility(liquid: ti.template(), dc, heat_w, water, wanted_c):
     """Compute pump, reuse, cooler and trim chiller; return the facility water's supply in C."""
     of_dc = liquid.dcs[dc]
-    of_dc.facility_pump_w = 0.0
-    of_dc.cooler_fan_w = 0.0
-    of_dc.cooler_w = 0.0
-    of_dc.trim_load_w = 0.0
-    of_dc.taken_w = 0.0
-    of_dc.heat_pump_w = 0.0
-    of_dc.evaporated_w = 0.0
+    _clear_facility(liquid, dc)
     supply_c, return_c = wanted_c, wanted_c
     if water > 0.0:
         all_w = heat_w + of_dc.facility_fluid_share * _facility_pump_w(liquid, dc, water)
@@ -743,7 +746,8 @@ def _settle_facility(liquid: ti.template(), dc, heat_w, water, wanted_c):
         into_c -= taken_w / water
         air_c, z, k, trim_w = _cooler(liquid, dc, water, into_c, to_cooler_w)
         cooler_w = to_cooler_w - trim_w
-        # What is not taken warms the water up; a bypass keeps it from becoming too cold.
+        # Heat that neither cooler nor trim chiller takes warms the water. A bypass of the cooler
+        # keeps the water from becoming colder than its setpoint.
         if k > 0.0:
             into_c = ti.max(into_c, air_c + cooler_w / k)
         supply_c = into_c - to_cooler_w / water

@@ -148,7 +148,7 @@ def test_recorded_runs(name: str, path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 class HarlWrapper:
-    """What the wrappers of HARL do with the released class, in short."""
+    """Calls of the released class in the order in which the wrappers of HARL make them."""
 
     def __init__(self, keys: dict[str, Any]) -> None:
         self.env = SustainDC(keys)

@@ -50,7 +50,8 @@ HEAT = (
     ("liquid_rejected_w", SKY, "rejected outdoors"),
     ("liquid_stored_w", PINK, "stored"),
 )
-"""Where the heat of liquid-cooled racks goes: column, colour, label. All are one sum."""
+"""Parts, in W, into which the power of liquid-cooled racks and their loops divides: column, colour,
+label."""
 POWER = (
     ("cdu_pump_w", BLUE, "CDU pumps"),
     ("facility_pump_w", SKY, "facility pumps"),

@@ -371,7 +371,7 @@ def _print_loops(sim: Simulator, objective: Objective, steps: int) -> None:
     for dc, name in enumerate(sim.fleet.names):
         try:
             one = sim.drivers.take([dc])
-            found = loop_optimum(
+            best = loop_optimum(
                 build_fleet(sim.fleet.configs[dc]),
                 one,
                 start=one.start,
@@ -383,7 +383,7 @@ def _print_loops(sim: Simulator, objective: Objective, steps: int) -> None:
             print(error)
             continue
         bound, achieved = (
-            100.0 * (float(x[0] / found.idle[0]) - 1.0) for x in (found.bound, found.achieved)
+            100.0 * (float(x[0] / best.idle[0]) - 1.0) for x in (best.bound, best.achieved)
         )
         print(
             f"{name}: coolant loops alone, over all steps: bound {bound:.2f} %, achieved "

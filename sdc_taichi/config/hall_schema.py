@@ -28,6 +28,7 @@ from sdc_taichi.config.fields import (
     WorkingShare,
     check_one_per_rack,
 )
+from sdc_taichi.config.hvac_schema import USUAL_AIR_J_PER_M3_K
 from sdc_taichi.config.liquid_schema import LiquidRack, RearDoor, with_model
 from sdc_taichi.errors import shortened, suggestion_or_valid
 from sdc_taichi.plant.servers import Knee, ServerCurves, curve_through, linear_curve
@@ -45,8 +46,6 @@ draw more power for their height are not heavier."""
 ROOM_J_PER_K_W = 15.0
 """Heat capacity of coils, water in the coils and raised floor, whose temperatures follow the supply
 air, divided by the servers' power at full load, in J/(K W)."""
-AIR_J_PER_M3_K = 1200.0
-"""Heat capacity of air at sea level, in J/(m3 K), for the airflow of servers with a rear door."""
 DOOR_RISE_K = 13.0
 """Design rise of the air through servers with a rear door that give neither rise nor airflow, in
 K."""
@@ -241,7 +240,7 @@ def _airflow_m3s(group: ServerGroup) -> float:
     """Return the airflow of a server in front of a rear door at full load, in m3/s."""
     if group.full_airflow_m3s is not None:
         return group.full_airflow_m3s
-    return group.full_w / (AIR_J_PER_M3_K * (group.design_rise_k or DOOR_RISE_K))
+    return group.full_w / (USUAL_AIR_J_PER_M3_K * (group.design_rise_k or DOOR_RISE_K))
 
 
 class RackType(Section):
@@ -281,12 +280,12 @@ class RackType(Section):
         """Rack as the coolant sees it; None for racks without coolant."""
         if self.rear_door is None or self.servers is None:
             return self.liquid
-        idle_w, full_w = (
-            sum(g.count * power for g, power in zip(self.servers, powers, strict=True))
-            for powers in zip(*((g.idle_w, g.full_w) for g in self.servers), strict=True)
-        )
+        idle_w = sum(group.count * group.idle_w for group in self.servers)
+        full_w = sum(group.count * group.full_w for group in self.servers)
         airflow_m3s = sum(g.count * _airflow_m3s(g) for g in self.servers)
-        return self.rear_door.as_liquid(idle_w, full_w, full_w / (airflow_m3s * AIR_J_PER_M3_K))
+        return self.rear_door.as_liquid(
+            idle_w, full_w, full_w / (airflow_m3s * USUAL_AIR_J_PER_M3_K)
+        )
 
     @property
     def air_servers(self) -> tuple[ServerGroup, ...]:

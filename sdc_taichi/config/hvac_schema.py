@@ -33,7 +33,8 @@ from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 USUAL_AIR_J_PER_M3_K = 1.2e3
-"""Volumetric heat capacity of air near sea level, in J/(m3 K); only checks use it."""
+"""Volumetric heat capacity of air near sea level, in J/(m3 K), for checks and for servers with a
+rear door."""
 USUAL_COUPLING = 0.75
 """Coupling of CRAC units under a raised floor, between fixed shares and one pressure; an
 assumption."""

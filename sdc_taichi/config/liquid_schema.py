@@ -262,6 +262,11 @@ class CduConfig(Section):
     min_valve: WorkingShare = 0.05
     """Smallest flow of facility water through a CDU, divided by its design flow, 0.01..1."""
 
+    @property
+    def count(self) -> int:
+        """Number of CDUs of all manifolds."""
+        return self.manifolds * self.per_manifold
+
     @model_validator(mode="after")
     def _some_are_needed(self) -> Self:
         if self.spare >= self.per_manifold:

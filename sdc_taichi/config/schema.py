@@ -357,11 +357,7 @@ class DataCenterConfig(Section):
     @model_validator(mode="after")
     def _names_existing_places(self) -> Self:
         crac, racks = self.hvac.crac, self.hall.racks
-        cdus = (
-            0
-            if self.liquid is None
-            else self.liquid.cdus.manifolds * (self.liquid.cdus.per_manifold)
-        )
+        cdus = 0 if self.liquid is None else self.liquid.cdus.count
         for index, event in enumerate(self.events.scheduled):
             units = cdus if event.kind in LIQUID_EVENTS else crac.units
             for name, limit in (("unit", units), ("rack", racks)):

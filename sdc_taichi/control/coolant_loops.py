@@ -1,4 +1,4 @@
-"""What CDUs measure of their coolant loops: return temperature, hottest junctions, headroom."""
+"""Measurements at CDUs: coolant return in C, hottest junction in C, and headroom in K."""
 
 from __future__ import annotations
 

@@ -95,11 +95,11 @@ def hall_env(
     """
     options = arguments.pop("options", None)
     chosen = {} if options is None else fields_set(options)
-    given = chosen | arguments
+    named = chosen | arguments
     defaults = LIQUID_OPTIONS if _has_liquid(config) else HALL_OPTIONS
-    if "plant" not in given.get("agents", ("plant",)):
+    if "plant" not in named.get("agents", ("plant",)):
         defaults = {name: value for name, value in defaults.items() if name != "commands"}
-    arguments = defaults | given
+    arguments = defaults | named
     if arguments["actions"] == "continuous":
         decided = _decided(arguments["agents"], arguments.get("commands") or {})
         for option, value in (LARGEST_CHANGES[x] for x in LARGEST_CHANGES if x in decided):

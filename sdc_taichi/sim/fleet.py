@@ -390,9 +390,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         manifold_offsets=offsets_from_counts(
             [0 if c is None else c.manifolds for c in cdus], "manifolds"
         ),
-        cdu_offsets=offsets_from_counts(
-            [0 if c is None else c.manifolds * c.per_manifold for c in cdus], "CDUs"
-        ),
+        cdu_offsets=offsets_from_counts([0 if c is None else c.count for c in cdus], "CDUs"),
         liquid=liquid_fleet(listed),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
         shared_work=shared_work(listed),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from sdc_taichi.plant.tower import (
     yorkcalc_reference_water_kg_s,
 )
 from sdc_taichi.plant.water import EVAPORATION_HEAT_J_PER_KG
-from sdc_taichi.types import F64, Values
+from sdc_taichi.types import F64, State, Values
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.named_kernel import NamedKernel
@@ -53,25 +53,11 @@ a manifold, and during other failures, in s."""
 LEAST_FLOW = 0.5
 """Flow that the CDUs of a manifold can give, as a share of design, with the usual substeps of
 failures."""
-
-
 MOST_FLOW = 1.1
 """Largest flow of coolant, as a share of design."""
 LEAST_CAPTURE, LEAST_K_PER_W, LEAST_LOSS_W_PER_K = 1e-3, 1e-6, 1.0
 """Lower bounds of the share of the heat of chips in the coolant, of their resistance in K/W, and of
 the losses of the pipes of a rack in W/K, so that every heat flow has a temperature."""
-
-
-class LiquidCarry(Protocol):
-    """State of coolant loops between steps, as in ``LiquidState``."""
-
-    cdu_setpoint_c: F64
-    cdu_flow: F64
-    junction_c: F64
-    manifold_return_c: F64
-    manifold_supply_c: F64
-    facility_return_c: F64
-    facility_supply_c: F64
 
 
 @dataclass
@@ -320,7 +306,9 @@ class Liquid:
         state, _ = self._run(self._initial, inputs, transient=False)
         return state
 
-    def step(self, state: LiquidCarry, inputs: LiquidInputs) -> tuple[LiquidState, LiquidResult]:
+    def step(
+        self, state: LiquidState | State, inputs: LiquidInputs
+    ) -> tuple[LiquidState, LiquidResult]:
         """Compute one step of B data centers.
 
         Args:
@@ -333,7 +321,7 @@ class Liquid:
         return self._run(state, inputs, self._transient)
 
     def _run(
-        self, state: LiquidCarry, inputs: LiquidInputs, transient: bool
+        self, state: LiquidState | State, inputs: LiquidInputs, transient: bool
     ) -> tuple[LiquidState, LiquidResult]:
         """Run the kernel, and a second time where its heat sets the temperature of tower water."""
         setpoint_c, flow = self._set_inputs(state, inputs)
@@ -345,7 +333,7 @@ class Liquid:
                 self._launch(state, transient)
         return self._after(setpoint_c, flow), self._result(inputs)
 
-    def _set_inputs(self, state: LiquidCarry, inputs: LiquidInputs) -> tuple[F64, F64]:
+    def _set_inputs(self, state: LiquidState | State, inputs: LiquidInputs) -> tuple[F64, F64]:
         """Write the inputs of a step; return setpoints in C and flows of the CDUs, (C,) each."""
         rows = self._inputs
         setpoint_c, flow = state.cdu_setpoint_c, state.cdu_flow
@@ -412,7 +400,7 @@ class Liquid:
         at_least = np.ceil(self._step_s / PUMP_FAILURE_SUBSTEP_S)
         np.maximum(substeps, np.where(short_of_flow, at_least, 0.0), out=substeps)
 
-    def _launch(self, state: LiquidCarry, transient: bool) -> None:
+    def _launch(self, state: LiquidState | State, transient: bool) -> None:
         """Run the kernel from a state."""
         if transient:
             rows = self._states

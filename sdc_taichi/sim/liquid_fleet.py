@@ -48,7 +48,7 @@ def liquid_fleet(configs: Sequence[DataCenterConfig]) -> LiquidFleet | None:
         ends = np.linspace(0, len(of_dc), liquid.cdus.manifolds + 1).round().astype(int)
         racks_per_loop += [end - begin for begin, end in pairwise(ends)]
         cdus_per_loop += [liquid.cdus.per_manifold] * liquid.cdus.manifolds
-        cdus += [liquid] * (liquid.cdus.manifolds * liquid.cdus.per_manifold)
+        cdus += [liquid] * liquid.cdus.count
     usual = LiquidConfig()
     plants = [config.liquid or usual for config in configs]
     return LiquidFleet(

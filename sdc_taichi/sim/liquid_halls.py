@@ -160,6 +160,7 @@ class LiquidHalls:
             powered = (on > 0.0).astype(np.float64)
         else:
             powered = on
+        failures = self._failures(surroundings)
         after, result = self._model.step(
             state,
             LiquidInputs(
@@ -173,13 +174,14 @@ class LiquidHalls:
                 facility_approach_k=commands.facility_approach_k,
                 reuse_share=commands.reuse_share,
                 power_cap=commands.power_cap,
-                **self._failures(surroundings),
+                **failures,
             ),
         )
         # Cold lines can take up more than racks give while they have no power.
         result.air_w = np.maximum(result.air_w, 0.0)
         self._hall.set_heat(result.air_w)
-        return self._as_step(after, result, on, share, surroundings)
+        has_coolant = self._coolant_flows(surroundings, failures)
+        return self._as_step(after, result, on, share, has_coolant)
 
     def with_liquid(self, air: HallSums, step: LiquidStep) -> dict[str, Reals]:
         """Return quantities of the halls in which liquid-cooled racks have their whole power."""
@@ -221,7 +223,7 @@ class LiquidHalls:
         result: LiquidResult,
         on: F64,
         share: F64 | None,
-        surroundings: Surroundings,
+        coolant_flows: Mask,
     ) -> LiquidStep:
         """Return a step from the results of the model.
 
@@ -230,7 +232,7 @@ class LiquidHalls:
             result: Results of the model.
             on: Share of the step in which each liquid-cooled rack is on, (L,).
             share: Share of the step that the results of the model describe, (B,); None for all.
-            surroundings: Failures of the step.
+            coolant_flows: True for liquid-cooled racks whose coolant can flow, (L,).
         """
         values = {
             name: getattr(result, name) for name in _NAMES[DATA_CENTERS] if name in _OF_RESULT
@@ -254,7 +256,7 @@ class LiquidHalls:
         of_racks_c, of_racks_w = np.zeros((2, self._fleet.racks))
         of_racks_c[self._racks], of_racks_w[self._racks] = result.junction_each_c, liquid_w
         has_coolant = np.ones(self._fleet.racks, np.bool_)
-        has_coolant[self._racks] = self._coolant_flows(surroundings)
+        has_coolant[self._racks] = coolant_flows
         air_w = on * result.air_w
         while_on_w = np.divide(it_w - air_w, on, out=np.zeros(len(on)), where=on > 0.0)
         return LiquidStep(
@@ -316,16 +318,15 @@ class LiquidHalls:
             failures["rack_valve"] = np.where(surroundings.rack_leaks, 0.0, 1.0)
         return failures
 
-    def _coolant_flows(self, surroundings: Surroundings) -> Mask:
+    def _coolant_flows(self, surroundings: Surroundings, failures: dict[str, Any]) -> Mask:
         """Return True for liquid-cooled racks whose coolant can flow and be cooled, (L,)."""
         if surroundings.cdu_up is None:
             return np.ones(len(self._racks), np.bool_)
         assert surroundings.facility_pump is not None
         assert surroundings.rack_leaks is not None
-        flows = self._failures(surroundings)
-        pumping = flows["cdu_up"] * flows.get("cdu_pumps", 1.0)
+        pumping = failures["cdu_up"] * failures.get("cdu_pumps", 1.0)
         per_manifold = np.bincount(self._cdu_manifold, pumping, self._manifolds)
-        has_water = flows["facility_pump"][self._dc] > 0.0
+        has_water = failures["facility_pump"][self._dc] > 0.0
         return np.asarray(
             (per_manifold[self._manifold] > 0.0) & has_water & ~surroundings.rack_leaks
         )
