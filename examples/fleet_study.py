@@ -47,7 +47,8 @@ def variants(sites: Sequence[str]) -> dict[str, dict[str, Any]]:
     named: dict[str, dict[str, Any]] = {"both": free}
     named["space"] = {**free, "queue_limit_h": 0.001}
     named |= {f"link {x}": {**free, "link_share_per_hour": x} for x in (0.2, 0.1, 0.05, 0.02)}
-    named |= {f"ratio {x}": {**free, "transfer_kwh_per_task": x * TASK_KWH} for x in (0.06, 0.3, 1)}
+    ratios = (0.06, 0.3, 1, 2)
+    named |= {f"ratio {x}": {**free, "transfer_kwh_per_task": x * TASK_KWH} for x in ratios}
     if all(len(group) > 1 for group in groups):
         named["3 regions"] = {**free, "residency": groups}
     return named
