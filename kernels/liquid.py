@@ -328,10 +328,24 @@ def _trip(liquid: ti.template(), dc, r, time_s):
 
 @ti.func
 @no_type_check
+def _door_share(liquid: ti.template(), dc, r, power_w):
+    """Return the share of the heat that a rear door takes with coolant at room temperature.
+
+    It is the effectiveness, or less where the coolant flows so slowly that it leaves as warm as the
+    air of the servers.
+    """
+    rack = liquid.racks[r]
+    rate = rack.m3s * liquid.dcs[dc].j_per_m3_k
+    of_air = ti.max(power_w * rack.per_door_rise, liquid.real(1e-9))
+    return ti.min(rack.door_effectiveness, rate / of_air)
+
+
+@ti.func
+@no_type_check
 def _air_servers(liquid: ti.template(), dc, r, supply_c):
     """Return power without GPUs, and the part of it that the coolant takes, in W.
 
-    A rear door takes effectiveness (1 + (T_room - T_supply) / rise) of the heat.
+    A rear door takes share (1 + (T_room - T_supply) / rise) of the heat.
     """
     rack = liquid.racks[r]
     u = rack.utilisation
@@ -340,7 +354,7 @@ def _air_servers(liquid: ti.template(), dc, r, supply_c):
     capture = rack.capture_other
     if rack.door_effectiveness > 0.0:
         warmer = (liquid.dcs[dc].room_c - supply_c) * rack.per_door_rise
-        capture = rack.door_effectiveness * (1.0 + warmer)
+        capture = _door_share(liquid, dc, r, other_w) * (1.0 + warmer)
         capture = clip(capture, liquid.real(0.0), liquid.real(MOST_TO_DOOR))
     return cpus_w + other_w, rack.capture_chip * cpus_w + capture * other_w
 
@@ -369,7 +383,8 @@ def _cap_w(liquid: ti.template(), dc, r):
 def _rack_at_rest(liquid: ti.template(), dc, r, supply_c):
     """Compute power, heat into the coolant and junction of a rack in steady state.
 
-    A GPU draws p0 (1 + leak (T_junction - T_ref)); solved for the power,
+    Racks without GPUs have a junction of 0. A GPU draws p0 (1 + leak (T_junction - T_ref)); solved
+    for the power,
 
         p = p0 (1 + leak (T_supply - T_ref)) / (1 - leak p0 R),   T_junction = T_supply + R p,
 
@@ -378,7 +393,8 @@ def _rack_at_rest(liquid: ti.template(), dc, r, supply_c):
     rack = liquid.racks[r]
     rest_w, rest_to_liquid_w = _air_servers(liquid, dc, r, supply_c)
     u, idle_w, resistance = rack.utilisation, rack.gpu_idle_w, rack.capture_chip * rack.r_k_per_w
-    junction_c, gpus_w, lost = supply_c, liquid.real(0.0), liquid.real(0.0)
+    gpus_w, lost = liquid.real(0.0), liquid.real(0.0)
+    junction_c = ti.select(rack.gpus > 0.0, supply_c, liquid.real(0.0))
     if rack.gpus > 0.0 and rack.runs > 0.0:
         base_w = idle_w + rack.gpu_span_w * u
         leak_w_per_k = rack.leak_per_k * base_w
@@ -413,7 +429,9 @@ def _settle(liquid: ti.template(), dc):
         tripped = 0
         r = liquid.rack_offsets[first]
         while r < liquid.rack_offsets[end]:
-            if liquid.racks[r].runs > 0.0 and (most_open <= 0.0 or _trips_by_flow(liquid, r)):
+            # Without facility water the racks that need coolant are off.
+            needs = liquid.racks[r].runs > 0.0 and liquid.racks[r].trip_flow > 0.0
+            if needs and (most_open <= 0.0 or _trips_by_flow(liquid, r)):
                 _trip(liquid, dc, r, liquid.real(0.0))
                 tripped += 1
             r += liquid.one
@@ -462,7 +480,7 @@ def _settle_manifold(liquid: ti.template(), dc, m, most_open, wanted_water_c, ex
         _rack_at_rest(liquid, dc, r, supply_c)
         gain_w += rack.liquid_w
         if rack.door_effectiveness > 0.0 and rack.liquid_w > 0.0:
-            slope += rack.it_w * rack.door_effectiveness * rack.per_door_rise
+            slope += rack.it_w * rack.per_door_rise * _door_share(liquid, dc, r, rack.it_w)
         r += liquid.one
     room_c = of_dc.room_c
     return_c = (rate * supply_c + gain_w + loss * room_c) / (rate + loss)
@@ -867,7 +885,7 @@ def _advance_rack(liquid: ti.template(), dc, r, supply_c, dt, part, time_s):
     powered, u = rack.powered * rack.runs, rack.utilisation
     rest_w, to_liquid_w = powered * rest_w, powered * to_liquid_w
     air_w = rest_w - to_liquid_w
-    it_w, junction_c = rest_w, supply_c
+    it_w, junction_c = rest_w, liquid.real(0.0)
     if rack.gpus > 0.0:
         before_c, capture, idle_w = rack.junction_c, rack.capture_chip, rack.gpu_idle_w
         to_coolant_w = rack.k_w_per_k * (before_c - supply_c)

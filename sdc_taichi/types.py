@@ -427,7 +427,7 @@ class LiquidQuantities:
     liquid_air_w: Annotated[F64, Quantity("W")]
     """Heat of liquid-cooled racks, their lines and pumps that goes into the air of the hall."""
     junction_max_c: Annotated[F64, Quantity("C")]
-    """Highest junction temperature of GPUs."""
+    """Highest junction temperature of GPUs; 0 without GPUs."""
     cdu_supply_c: Annotated[F64, Quantity("C")]
     """Temperature of the coolant to the racks, mean over the CDUs weighted by flow."""
     cdu_return_c: Annotated[F64, Quantity("C")]
@@ -482,7 +482,7 @@ class LiquidQuantities:
     cdu_valve: Annotated[F64, Quantity("1", CDUS)]
     """Flow of facility water through each CDU, divided by its design flow."""
     rack_junction_c: Annotated[F64, Quantity("C", RACKS)]
-    """Junction temperature of the GPUs of each rack; 0 for air-cooled racks."""
+    """Junction temperature of the GPUs of each rack; 0 for racks without GPUs on cold plates."""
     rack_liquid_w: Annotated[F64, Quantity("W", RACKS)]
     """Heat of each rack that goes into the coolant; 0 for air-cooled racks."""
 

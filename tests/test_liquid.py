@@ -381,7 +381,7 @@ def test_rear_doors_take_more_heat_with_colder_coolant() -> None:
     result = steady(fleet_of(of_rack=of_rack, of_cdu=of_cdu), 1.0, 5.0)
     share = 0.6 * (1.0 + (27.0 - 22.0) / 13.0)
     close(result.liquid_heat_w / result.liquid_it_w, share, 1e-8)
-    close(result.junction_max_c, 22.0, 1e-8)
+    assert result.junction_max_c == 0.0
     # Without heat for the CDUs, pipes lose what doors take.
     hot = steady(fleet_of(of_rack=of_rack, of_cdu={**of_cdu, "setpoint_c": 45.0}))
     assert hot.cdu_heat_w[0] == 0.0
@@ -481,7 +481,7 @@ def test_heat_is_conserved_on_random_plants(transient: bool) -> None:
                 rest = sum(x for other, x in terms.items() if other != name)
                 assert np.max(np.abs(rest) / gross_w) > 1e-6, name
         # Racks with power pass on all heat into the air.
-        shut = False if inputs.rack_valve is None else inputs.rack_valve == 0.0
+        shut = fleet.has_plates & (inputs.rack_valve is not None and inputs.rack_valve == 0.0)
         powered = np.where(shut, 0.0, inputs.powered)
         dc = fleet.manifold_dc[fleet.rack_manifold]
         air_w = np.bincount(dc, result.air_w * powered, len(gross_w))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -100,12 +101,16 @@ def wild_actions(rng: np.random.Generator, size: int, cdus: int) -> Actions:
     )
 
 
-def recorded(configs: list[DataCenterConfig], steps: int) -> Run:
+def recorded(
+    configs: list[DataCenterConfig],
+    steps: int,
+    act: Callable[[np.random.Generator, int, int], Actions | None] = wild_actions,
+) -> Run:
     rng, rows = np.random.default_rng(3), []
     with Simulator(configs, precision="f64", limits="flag") as sim:
         start, battery_kwh = stocks(sim.reset(seed=2)), sim.sizing.battery_kwh
         for _ in range(steps):
-            result = sim.step(wild_actions(rng, sim.size, sim.fleet.cdus))
+            result = sim.step(act(rng, sim.size, sim.fleet.cdus))
             assert np.all(result.within_limits == 1.0)
             rows.append(quantities(sim.fleet, result))
         air = air_j_per_m3_k(sim.fleet)
@@ -208,6 +213,38 @@ def test_rear_doors_take_more_heat_from_the_air_the_colder_their_coolant() -> No
         share = 0.6 * (1.0 + (27.0 - coolant_c) / 13.0)
         np.testing.assert_allclose(taken_w[dc][web[dc]], share * power_w[dc][web[dc]], rtol=1e-6)
     assert step.cooling_load_w[1] < step.cooling_load_w[2] < step.cooling_load_w[0]
+
+
+@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
+def test_racks_with_a_rear_door_run_on_in_air_without_coolant(thermal: str) -> None:
+    listed = [
+        {"kind": "facility_pump_down", "start_h": 2, "duration_h": 0.5, "share": 0.0},
+        {"kind": "cdu_down", "start_h": 6, "duration_h": 0.5},
+        {"kind": "leak", "start_h": 10, "duration_h": 0.5, "rack": 4, "litres": 30},
+    ]
+    types = {"web": with_doors()["rack_types"]["web"]}
+    config = liquid_hall(
+        hall={"rack_types": types, "rack_plan": [{"type": "web"}]},
+        simulation={"thermal": thermal, "steps_per_hour": 12},
+        events={"scheduled": listed},
+        liquid={"setpoint_c": 25},
+    )
+    run = recorded([config], 132, lambda *_: None)
+    for name in ("heat", "liquid", "cooling load", "coils", "server power"):
+        worst = residual(LEDGERS[name](run), floor=1e-3).max()
+        assert worst < 1e-12, (name, worst)
+    assert not run["tripped_racks"].any()
+    assert not run["junction_max_c"].any()
+    for start in (24, 72):
+        rise_k = run["inlet_max_c"][start + 5] - run["inlet_max_c"][start - 1]
+        assert rise_k > 2.0
+        # The racks warm the coolant until their doors take no more than the pipes lose.
+        taken = run["liquid_heat_w"][start - 1 : start + 6, 0]
+        assert taken[-1] < 0.05 * taken[0]
+        np.testing.assert_allclose(run["liquid_air_w"][start + 5], run["cpu_w"][start + 5], 0.01)
+    assert run["leak_l"].sum() == 30.0
+    # The other eleven doors take heat while one is isolated.
+    assert run["liquid_heat_w"][125] == pytest.approx(run["liquid_heat_w"][126] * 11 / 12, rel=0.02)
 
 
 def test_work_of_limited_gpus_waits_in_the_queue() -> None:

@@ -64,7 +64,8 @@ class RackParameters:
     trip_c: Values = 105.0
     """Junction temperature above which the rack switches off, in C, (L,)."""
     trip_flow_share: Values = 0.4
-    """Flow of coolant below which the rack switches off, as a share of design, (L,)."""
+    """Flow of coolant below which a rack without a rear door switches off, as a share of design,
+    (L,)."""
     lpm_per_kw: Values = 1.2
     """Design flow of coolant, in l/min per kW of ``liquid_design_w``, (L,)."""
     liquid_design_w: Values = 115e3
@@ -226,6 +227,12 @@ class LiquidFleet:
     def manifold_dc(self) -> Offsets:
         """Data center of each manifold, (M,)."""
         return _items(self.manifold_offsets)
+
+    @property
+    def has_plates(self) -> npt.NDArray[np.bool_]:
+        """True for racks with cold plates, False for those with a rear door, (L,)."""
+        doors = np.broadcast_to(self.racks.door_effectiveness, self.rack_manifold.shape)
+        return np.asarray(doors == 0.0)
 
     @classmethod
     def of_equal(

@@ -113,8 +113,8 @@ class LiquidInputs:
     cooler_share: F64 | None = None
     """Share of the cooler's fans that work, 0..1, (B,)."""
     rack_valve: F64 | None = None
-    """Opening of the valve of each rack, 0..1, (L,); a rack at 0, such as one that leaks, is
-    off."""
+    """Opening of the valve of each rack, 0..1, (L,); a rack with cold plates at 0, such as one that
+    leaks, is off."""
     leak_l: F64 | None = None
     """Coolant lost by leaks, in l, (B,)."""
 
@@ -130,7 +130,7 @@ class LiquidResult:
     liquid_air_w: F64
     """Heat of racks with coolant, their pipes and pumps into the air of the hall, in W, (B,)."""
     junction_max_c: F64
-    """Hottest junction during the step, in C, (B,)."""
+    """Hottest junction during the step, in C, (B,); 0 without GPUs."""
     cdu_supply_c: F64
     """Coolant that reaches the racks, mean by flow, in C, (B,)."""
     cdu_return_c: F64
@@ -185,7 +185,7 @@ class LiquidResult:
     """Heat of each rack into the air while it has power, with its part of pipes and pumps, in W,
     (L,)."""
     junction_each_c: F64
-    """Hottest junction of each rack during the step, in C, (L,)."""
+    """Hottest junction of each rack during the step, in C, (L,); 0 without GPUs."""
     rack_m3s: F64
     """Flow of coolant of each rack at the end of the step, in m3/s, (L,)."""
     lost_utilisation: F64
@@ -386,7 +386,7 @@ class Liquid:
         if inputs.rack_valve is not None:
             shut = inputs.rack_valve <= 0.0
             rows["open"] *= inputs.rack_valve
-            rows["powered"][shut] = 0.0
+            rows["powered"][shut & self.fleet.has_plates] = 0.0
             has_failure[self.fleet.manifold_dc[self.fleet.rack_manifold[shut]]] = True
         loop = self.fleet.cdu_manifold[(rows["up"] < 1.0) | (rows["pumps"] < 1.0)]
         has_failure[self.fleet.manifold_dc[loop]] = True
@@ -633,7 +633,7 @@ class Liquid:
             "r_film_k_m3s_per_w": p.a_k_lpm_per_w * M3S_PER_LPM * gpus / p.chip_flow_share,
             "throttle_c": p.throttle_c,
             "trip_c": p.trip_c,
-            "trip_flow": p.trip_flow_share,
+            "trip_flow": np.where(self.fleet.has_plates, p.trip_flow_share, 0.0),
             "design_m3s": self.sizing.rack_m3s,
             "loss_w_per_k": np.maximum(p.loss_w_per_k, LEAST_LOSS_W_PER_K),
             "chips_j_per_k": gpus * p.chip_j_per_k,

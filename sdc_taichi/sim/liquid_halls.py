@@ -70,7 +70,7 @@ class LiquidStep:
     tripped: Mask
     """True for racks that switch off, (R,)."""
     has_coolant: Mask
-    """True for racks in air, and for those whose coolant can flow, (R,)."""
+    """True for racks without cold plates, and for those whose coolant can flow, (R,)."""
     throttled_tasks: F64
     """Started work that limited GPUs did not complete, in tasks, (B,)."""
     state: dict[str, F64]
@@ -232,7 +232,7 @@ class LiquidHalls:
             result: Results of the model.
             on: Share of the step in which each liquid-cooled rack is on, (L,).
             share: Share of the step that the results of the model describe, (B,); None for all.
-            coolant_flows: True for liquid-cooled racks whose coolant can flow, (L,).
+            coolant_flows: Result of ``_coolant_flows``, (L,).
         """
         values = {
             name: getattr(result, name) for name in _NAMES[DATA_CENTERS] if name in _OF_RESULT
@@ -319,7 +319,10 @@ class LiquidHalls:
         return failures
 
     def _coolant_flows(self, surroundings: Surroundings, failures: dict[str, Any]) -> Mask:
-        """Return True for liquid-cooled racks whose coolant can flow and be cooled, (L,)."""
+        """Return True for racks that need no coolant, or whose coolant flows and is cooled, (L,).
+
+        Racks with a rear door run on in air.
+        """
         if surroundings.cdu_up is None:
             return np.ones(len(self._racks), np.bool_)
         assert surroundings.facility_pump is not None
@@ -327,17 +330,17 @@ class LiquidHalls:
         pumping = failures["cdu_up"] * failures.get("cdu_pumps", 1.0)
         per_manifold = np.bincount(self._cdu_manifold, pumping, self._manifolds)
         has_water = failures["facility_pump"][self._dc] > 0.0
-        return np.asarray(
-            (per_manifold[self._manifold] > 0.0) & has_water & ~surroundings.rack_leaks
-        )
+        flows = (per_manifold[self._manifold] > 0.0) & has_water & ~surroundings.rack_leaks
+        return np.asarray(flows | ~self._model.fleet.has_plates)
 
 
 def with_leaks(state: State, surroundings: Surroundings, fleet: Fleet) -> State:
-    """Return the state of a step in which racks that leak are off."""
+    """Return the state of a step in which racks whose cold plates leak are off."""
     if surroundings.rack_leaks is None or not surroundings.rack_leaks.any():
         return state
+    assert fleet.liquid is not None
     status = state.rack_status.copy()
-    status[fleet.liquid_racks[surroundings.rack_leaks]] = TRIPPED
+    status[fleet.liquid_racks[surroundings.rack_leaks & fleet.liquid.has_plates]] = TRIPPED
     return replace(state, rack_status=status)
 
 
