@@ -222,7 +222,7 @@ def test_parts_of_a_junction_add_up(thermal: str) -> None:
         for _ in range(8):
             result = sim.step(actions)
         parts = {cause: sim.junction_parts(3, dc) for dc, cause in enumerate(causes)}
-        with pytest.raises(SdcError, match=r"rack 4: is cooled by air; valid is .* such as 2"):
+        with pytest.raises(SdcError, match=r"rack 4: has no cold plates; valid is .* such as 2"):
             sim.junction_parts(4)
     for dc, (cause, each) in enumerate(parts.items()):
         terms = dict(junction_terms(each))
@@ -270,6 +270,49 @@ def test_show_describes_heat_cdus_and_water() -> None:
     assert "at most 36.0 C keeps the setpoint (class W32)" in text
 
 
+def test_a_hall_with_rear_doors_alone_has_no_junctions(tmp_path: Path) -> None:
+    doors = [*SMALL[:-3], "hall.rack_types={web: {servers: {count: 18, full_w: 600, idle_w: 170, "
+             "design_rise_k: 13}, rear_door: {}}}", "hall.rack_plan=[{type: web}]",
+             "liquid={setpoint_c: 22, facility: {trim_kw: 100}}",
+             "protection.ashrae_class=A2"]  # fmt: skip
+    config = load_config("corrected", doors)
+    no_plates = "no rack has cold plates; valid is a hall with liquid-cooled chips"
+    command = ["hall", "why", "--of", "junction"]
+    for more in ([], ["--rack", "1"]):
+        failed = CliRunner().invoke(app, [*command, "corrected", *doors, *more])
+        assert failed.exit_code == 2
+        assert no_plates in failed.output.replace("\n", " ")
+        assert failed.output.count("\n") <= 2
+    shown = call("hall", "show", "corrected", *doors)
+    assert "junction" not in shown.stdout
+    with Simulator(config) as sim, Recorder(tmp_path / "run.rrd") as recorder:
+        controller = make_controller("liquid=liquid-reset", sim.fleet)
+        simulate_to_folder(sim, controller, RunRequest("liquid=liquid-reset", 3), tmp_path / "run")
+        sim.reset()
+        recorder.begin(sim)
+        recorder.add(sim.step())
+    entities = read(tmp_path / "run.rrd")
+    assert "/dc/ai/liquid/loop_c" in entities
+    assert not any("junction" in entity for entity in entities)
+    run = read_run(tmp_path / "run")
+    assert "junction_c" not in read_racks(run, [0])[0]
+    html = report_html(run)
+    section = html[html.index("Liquid cooling of ai</h2>") :].partition("</section>")[0]
+    assert section.count("<figure>") == 2
+    assert "junction" not in section
+    study = study_failover(config, "liquid")
+    rows = {row["lost"]: row for row in failover_rows(study, range(len(study.losses)))}
+    assert rows["no loss"]["time_to_throttle_s"] is None
+    lost = rows["facility pumps"]
+    assert lost["hottest_inlet_60_min_c"] > rows["no loss"]["hottest_inlet_60_min_c"] + 3.0
+    assert all(
+        row["time_to_trip_s"] is None or row["time_to_trip_s"] >= 60 for row in rows.values()
+    )
+    assert rows["leak at rack 0"]["racks_off"] == 0
+    curves: Any = failover_figure(study).axes[1]
+    assert curves.get_ylabel() == "hottest inlet of the hall (°C)"
+
+
 def test_failover_of_liquid_cooling_counts_seconds() -> None:
     study = study_failover(load_config("corrected", SMALL), "liquid")
     rows = {row["lost"]: row for row in failover_rows(study, range(len(study.losses)))}
@@ -284,8 +327,11 @@ def test_failover_of_liquid_cooling_counts_seconds() -> None:
     half, whole = (rows[name]["hottest_junction_60_min_c"] for name in ("half of cooler", "cooler"))
     assert rows["no loss"]["hottest_junction_60_min_c"] <= half < whole
     assert study.losses[study.worst[0]].name == "CDU 0 + 1"
-    curves: Any = failover_figure(study).axes[1]
+    plan, curves, *_ = failover_figure(study).axes
     assert curves.get_ylabel() == "hottest junction of the hall (°C)"
+    assert "hottest minute, 1 min after the loss of CDU 0 + 1" in plan.get_title(loc="left")
+    worst = study.worst[0]
+    assert study.rack_c[worst].max() == study.hottest_c[:, worst].max()
     with pytest.raises(ConfigError, match="no rack is liquid-cooled"):
         study_failover(load_config("corrected"), "liquid")
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
-from sdc_taichi.run.failover import MINUTES, SHOWN_AFTER_MIN, Failover
+from sdc_taichi.run.failover import MINUTES, Failover
 from sdc_taichi.run.rack_places import RackPlaces
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
@@ -164,10 +164,11 @@ def _add_title_and_legend(axes: Axes, title: str, *, columns: int) -> None:
 def failover_figure(study: Failover) -> Figure:
     """Draw a failover study: racks after the worst loss, and their hottest one over time.
 
-    The floor plan shows the inlets after the worst loss of cooling, and colours each CRAC unit by
-    the effect of losing that unit alone: racks trip, racks throttle, or neither. The curves show
-    the hottest inlet of the hall after each of the worst losses. Studies of liquid cooling show
-    junctions in place of inlets.
+    The floor plan shows the inlets 15 minutes after the worst loss of cooling, and colours each
+    CRAC unit by the effect of losing that unit alone: racks trip, racks throttle, or neither. The
+    curves show the hottest inlet of the hall after each of the worst losses. Studies of liquid
+    cooling show junctions if there are some, and on the floor plan the hottest minute, because
+    junctions cool once racks have tripped.
 
     Args:
         study: result of ``study_failover``.
@@ -183,14 +184,15 @@ def failover_figure(study: Failover) -> Figure:
     page = _page(study.config.hall, study.config.hvac.crac.units, FAILOVER_SIDE_IN)
     _draw_room(axes, page)
     label = "hottest inlet of the rack (°C)"
-    if study.lost == "liquid":
-        rack_c, label = np.ma.masked_equal(rack_c, 0.0), "junction (°C)"
+    if study.of_junctions:
+        rack_c, label = np.ma.masked_equal(rack_c, 0.0), "hottest junction of the rack (°C)"
     _draw_racks(axes, page, RackValues(rack_c, label, hottest, "hottest rack"))
     if any(loss.units for loss in study.losses):
         _draw_failed_units(axes, page, study)
+    minute = study.shown_min[worst]
+    when = f"hottest minute, {minute} min" if study.lost == "liquid" else f"{minute} minutes"
     axes.set_title(
-        f"{literal_text(study.config.name)}: {SHOWN_AFTER_MIN[0]} minutes after the loss of "
-        f"{study.losses[worst].name}",
+        f"{literal_text(study.config.name)}: {when} after the loss of {study.losses[worst].name}",
         fontsize=10,
         loc="left",
     )
@@ -511,7 +513,7 @@ def _draw_curves(axes: Axes, study: Failover) -> None:
     assert protection.ashrae_class is not None
     limit_c = allowable_c(protection.ashrae_class)[1]
     limits_c, quantity = (limit_c, limit_c + protection.trip_margin_k), "inlet"
-    if study.lost == "liquid":
+    if study.of_junctions:
         limits_c, quantity = junction_limits_c(study.config) or limits_c, "junction"
     for level_c, text in zip(limits_c, ("throttle", "trip"), strict=True):
         axes.axhline(level_c, color="black", linestyle=":", linewidth=1.0)

@@ -67,12 +67,12 @@ COLUMNS = tuple(
 _PIPE_COLOURS = {"hot": RED, "cold": BLUE, "heat": ORANGE}
 
 
-def loop_history(steps: pd.DataFrame, throttle_c: float, title: str = "") -> Figure:
+def loop_history(steps: pd.DataFrame, throttle_c: float | None, title: str = "") -> Figure:
     """Draw temperatures of the loops, where the heat goes, and power of the devices over a run.
 
     Args:
         steps: steps of the data center.
-        throttle_c: junction temperature at which GPUs throttle, in C.
+        throttle_c: junction temperature at which GPUs throttle, in C; None without cold plates.
         title: text above the figure, such as the name of the data center.
 
     Raises:
@@ -82,8 +82,10 @@ def loop_history(steps: pd.DataFrame, throttle_c: float, title: str = "") -> Fig
     steps = check_steps(steps, ("time", *COLUMNS))
     panels = figure.subplots(3, 1, sharex=True, height_ratios=[4, 3, 2.5])
     for name, colour, label in TEMPERATURES:
-        draw_steps(panels[0], steps, steps[name], color=colour, label=label)
-    panels[0].axhline(throttle_c, color=RED, linewidth=0.8, linestyle=":")
+        if throttle_c is not None or name != "junction_max_c":
+            draw_steps(panels[0], steps, steps[name], color=colour, label=label)
+    if throttle_c is not None:
+        panels[0].axhline(throttle_c, color=RED, linewidth=0.8, linestyle=":")
     panels[0].set_ylabel("temperature (°C)")
     for axes, parts, label in ((panels[1], HEAT, "heat"), (panels[2], POWER, "power")):
         _draw_stack(axes, steps, parts, label)

@@ -127,8 +127,10 @@ def loop_texts(
         return f"{text}\n{1e3 * values[flow]:.1f} l/s" if flow else text
 
     heat_pump = f"\nheat pump {kw('heat_pump_w')}" * (liquid.reuse.kind == "heat_pump")
+    # Racks with rear doors alone have no junctions.
+    hottest = f"junction {water('junction_max_c')}" if values["junction_max_c"] else "rear doors"
     texts = {
-        "racks": f"\njunction {water('junction_max_c')}\nto coolant {kw('liquid_heat_w')}",
+        "racks": f"\n{hottest}\nto coolant {kw('liquid_heat_w')}",
         "cdus": f"\npumps {kw('cdu_pump_w')}",
         "reuse": heat_pump,
         "trim": f"\ntakes {kw('trim_load_w')}\npower {kw('trim_chiller_w')}",
@@ -150,9 +152,9 @@ def loop_texts(
 def junction_limits_c(config: DataCenterConfig) -> tuple[float, float] | None:
     """Return the lowest junction temperatures at which GPUs throttle and at which racks trip, in C.
 
-    The result is None for a data center without liquid-cooled racks.
+    The result is None for a data center without cold plates.
     """
-    racks = config.liquid_racks().values()
+    racks = config.plate_racks().values()
     if not racks:
         return None
     return min(rack.throttle_c for rack in racks), min(rack.trip_c for rack in racks)

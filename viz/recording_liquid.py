@@ -87,6 +87,15 @@ _LINE_APART, _ABOVE_LINE = 12.0, 7.0
 the diagram. The viewer draws a label of one line below each point."""
 
 
+def liquid_plots(*, has_junctions: bool) -> dict[str, Plot]:
+    """Return the plots of the loops of a data center by entity.
+
+    Args:
+        has_junctions: True for a data center with cold plates.
+    """
+    return {name: x for name, x in LIQUID_PLOTS.items() if has_junctions or name != "junction_c"}
+
+
 class LiquidPictures:
     """Junction map, diagram of the loops, and series of the loops and CDUs of one data center.
 
@@ -99,15 +108,17 @@ class LiquidPictures:
     def __init__(self, sim: Simulator, dc: int, cadence: Cadence) -> None:
         fleet = sim.fleet
         self._dc, self._cadence = dc, cadence
-        self._hall = fleet.configs[dc].hall
-        liquid = fleet.configs[dc].liquid
+        config = fleet.configs[dc]
+        self._hall, liquid = config.hall, config.liquid
         assert liquid is not None
         self._liquid = liquid
         self._racks = slice(*fleet.rack_offsets[dc : dc + 2].tolist())
         self._cdus = slice(*fleet.cdu_offsets[dc : dc + 2].tolist())
         self._cdu_count = int(np.diff(fleet.cdu_offsets)[dc])
+        self._has_junctions = bool(config.plate_racks())
+        self._plots = liquid_plots(has_junctions=self._has_junctions)
         self._factors = {
-            entity: line_factors(plot, sim.step_h) for entity, plot in LIQUID_PLOTS.items()
+            entity: line_factors(plot, sim.step_h) for entity, plot in self._plots.items()
         }
         self._series: Frames[dict[str, F64]] = Frames()
         self._junctions: Frames[F32] = Frames()
@@ -123,7 +134,7 @@ class LiquidPictures:
     def add(self, result: StepResult, active: Sequence[ActiveEvent]) -> None:
         """Add the series of a step, and map and diagram if they are due; as in ``Pictures``."""
         values: dict[str, F64] = {}
-        for entity, plot in LIQUID_PLOTS.items():
+        for entity, plot in self._plots.items():
             of_plot = [getattr(result, field)[self._dc] for _, field, _ in plot.lines]
             values[entity] = np.array(of_plot) * self._factors[entity]
         for entity, (field, _, factor) in CDU_PLOTS.items():
@@ -134,7 +145,7 @@ class LiquidPictures:
             every = self._cadence.map_every_steps_in_events
         if result.step % every == 0:
             junction_c = result.rack_junction_c[self._racks].astype(np.float32)
-            # Racks that are cooled by air have 0.
+            # Racks without cold plates have 0.
             self._junctions.append(
                 result.step, np.where(junction_c > 0, junction_c, np.float32(np.nan))
             )
@@ -144,7 +155,7 @@ class LiquidPictures:
 
     def entities(self, scales: Mapping[str, ColourScale]) -> Entities:
         """Yield the static entities; arguments as in ``Pictures``."""
-        for entity, plot in LIQUID_PLOTS.items():
+        for entity, plot in self._plots.items():
             names = [f"{name} [{plot.unit}]" for name, *_ in plot.lines]
             yield f"liquid/{entity}", series_lines(names, [colour for *_, colour in plot.lines])
         for entity, (_, title, _) in CDU_PLOTS.items():
@@ -190,17 +201,18 @@ class LiquidPictures:
         steps, series = self._series.take()
         if not series:
             return
-        for entity in (*LIQUID_PLOTS, *CDU_PLOTS):
+        for entity in (*self._plots, *CDU_PLOTS):
             values = np.stack([of_step[entity] for of_step in series])
             if entity in CDU_PLOTS:
                 values = low_mean_high(values)
             yield f"liquid/{entity}", steps, rr.Scalars.columns(scalars=values)
         if len(self._junctions):
             map_steps, junctions_c = self._junctions.take()
-            classes = classes_of(np.stack(junctions_c), scales["junction"])
-            images = heat_maps(classes, tile_grid(self._hall))
-            columns: Any = rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
-            yield "map/junction", map_steps, columns
+            if self._has_junctions:
+                classes = classes_of(np.stack(junctions_c), scales["junction"])
+                images = heat_maps(classes, tile_grid(self._hall))
+                columns: Any = rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
+                yield "map/junction", map_steps, columns
             text_steps, texts = self._texts.take()
             labels = rr.Points2D.columns(labels=[text for of_step in texts for text in of_step])
             yield "liquid/loop/texts", text_steps, labels.partition([len(each) for each in texts])

@@ -22,7 +22,7 @@ from . import hall_rasters as rasters
 from .colour_scales import ColourScale, annotation_context, invisible_names
 from .liquid_loop import SIZE as DIAGRAM_SIZE
 from .recording_flows import ABOUT_PATH, FLOW_PLOTS, MAP_PATH, FlowPictures
-from .recording_liquid import CDU_PLOTS, LIQUID_PLOTS
+from .recording_liquid import CDU_PLOTS, liquid_plots
 from .recording_racks import (
     DOWN_RGB,
     TRENDS,
@@ -92,6 +92,8 @@ class FocusTab(NamedTuple):
     """Height and width of the heat maps, in pixels."""
     has_airflow: bool
     """True if the recording has the airflow of the hall."""
+    has_liquid: bool
+    """True if the data center has liquid cooling."""
     zones: tuple[tuple[int, int], ...]
     """Number of rows and of places of each zone; empty if the recording has no zones."""
 
@@ -228,7 +230,7 @@ def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
     )
     airflow = [_airflow_view(tab)] if tab.has_airflow else []
     zones = [_zones_view(tab)] if tab.zones else []
-    liquid = [_liquid_view(tab)] if "junction" in tab.scales else []
+    liquid = [_liquid_view(tab)] if tab.has_liquid else []
     return rrb.Tabs(overview, racks, *airflow, *zones, cooling, *liquid, work, active_tab=0)
 
 
@@ -261,7 +263,7 @@ def _liquid_view(tab: FocusTab) -> Any:
     )
     plots = [
         _plot_view(f"{tab.path}/liquid/{entity}", f"{plot.title} [{plot.unit}]")
-        for entity, plot in LIQUID_PLOTS.items()
+        for entity, plot in liquid_plots(has_junctions="junction" in tab.scales).items()
     ]
     cdus = [
         _plot_view(f"{tab.path}/liquid/{entity}", f"CDU {title}")

@@ -383,6 +383,7 @@ class RecordingWriter:
                     scales_of_dc,
                     grid.image_shape,
                     has_airflow,
+                    self._fleet.configs[dc].liquid is not None,
                     sum(zones, ()),
                 )
             )

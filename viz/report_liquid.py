@@ -28,38 +28,41 @@ def liquid_section(run: RunFolder, dc: ShownDataCenter) -> list[Block]:
     """
     liquid, limits_c = dc.config.liquid, junction_limits_c(dc.config)
     assert liquid is not None
-    assert limits_c is not None
     name, steps, step_h = run.names[dc.index], dc.steps, float(run.metrics["step_h"])
-    at = steps.iloc[int(steps["junction_max_c"].to_numpy().argmax())]
-    hottest = (
-        f"hottest junction, {at['junction_max_c']:.1f} °C on "
-        f"{time_text(run, at['time'].to_pydatetime())}"
-    )
+    column = "junction_max_c" if limits_c else "liquid_heat_w"
+    at = steps.iloc[int(steps[column].to_numpy().argmax())]
+    value = at[column]
+    most = f"hottest junction, {value:.1f} °C" if limits_c else f"most heat, {value / 1e3:,.1f} kW"
+    shown = f"{most} on {time_text(run, at['time'].to_pydatetime())}"
     blocks = [
         key_figures(_figures(steps, step_h).items()),
         paragraph(_water_classes(steps["facility_supply_c"].to_numpy(), step_h)),
         picture(
             liquid_figures.loop_diagram({field: float(at[field]) for field in LOOP_FIELDS}, liquid),
-            f"Diagram of the coolant loops of {name} at its {hottest}: coolant from "
+            f"Diagram of the coolant loops of {name} at its {shown}: coolant from "
             f"{at['cdu_supply_c']:.1f} to {at['cdu_return_c']:.1f} °C, facility water from "
             f"{at['facility_supply_c']:.1f} to {at['facility_return_c']:.1f} °C.",
-            f"The loops in the step of the {hottest}.",
-        ),
-        picture(
-            rack_maps.junction_map(dc.racks["junction_c"].to_numpy(), dc.config.hall, limits_c),
-            f"Map of the racks of {name} by junction temperature at its {hottest}.",
-            f"Junction of each liquid-cooled rack in the step of the {hottest}. Grey racks are "
-            "cooled by air. Row 0 is on top.",
+            f"The loops in the step of the {shown}.",
         ),
     ]
+    if limits_c:
+        blocks.append(
+            picture(
+                rack_maps.junction_map(dc.racks["junction_c"].to_numpy(), dc.config.hall, limits_c),
+                f"Map of the racks of {name} by junction temperature at its {shown}.",
+                f"Junction of each rack with cold plates in the step of the {shown}. Other racks "
+                "are grey. Row 0 is on top.",
+            )
+        )
     if len(steps) < 2:
         return [*blocks, paragraph("A single step has no history.")]
+    throttle_c = limits_c[0] if limits_c else None
+    line = f"The dotted line is {throttle_c:g} °C, at which GPUs throttle. " if limits_c else ""
     history = picture(
-        liquid_figures.loop_history(steps, limits_c[0], name),
-        f"Temperatures of coolant, facility water and junctions of {name} over the run, where the "
-        "heat of its liquid-cooled racks went, and the power of pumps, fans and chillers.",
-        f"The loops over the run. The dotted line is {limits_c[0]:g} °C, at which GPUs throttle. "
-        "Heat below zero left storage in chips and loops.",
+        liquid_figures.loop_history(steps, throttle_c, name),
+        f"Temperatures of coolant and facility water of {name} over the run, where the heat of its "
+        "liquid-cooled racks went, and the power of pumps, fans and chillers.",
+        f"The loops over the run. {line}Heat below zero left storage in chips and loops.",
     )
     return [*blocks, history]
 

@@ -287,8 +287,9 @@ def _print_study(study: Failover) -> None:
     if study.note:
         typer.echo(study.note)
     if is_liquid:
+        place = "junction" if study.of_junctions else "inlet"
         typer.echo(
-            f"C is the hottest junction of the hall; - is not within {MINUTES} min; coolant is "
+            f"C is the hottest {place} of the hall; - is not within {MINUTES} min; coolant is "
             f"what the racks get after {SHOWN_AFTER_MIN[0]} min; racks off are those after "
             f"{MINUTES} min."
         )
@@ -541,7 +542,8 @@ def _liquid_lines(design: DesignHall) -> list[str]:
         f"{v['liquid_heat_w'] / 1e3:,.1f} kW into coolant, {v['liquid_air_w'] / 1e3:,.1f} kW into "
         "the air of the hall",
         f"coolant       {1e3 * v['coolant_m3s']:,.4g} l/s, {v['cdu_supply_c']:.1f} C to "
-        f"{v['cdu_return_c']:.1f} C; hottest junction {v['junction_max_c']:.1f} C",
+        f"{v['cdu_return_c']:.1f} C"
+        + (f"; hottest junction {v['junction_max_c']:.1f} C" if v["junction_max_c"] else ""),
         f"CDUs          {count_text(v['manifolds'], 'loop')} with {per_loop} of "
         f"{v['cdu_w'] / 1e3:,.0f} kW each, {needed} of them needed ({redundancy}); pumps "
         f"{v['cdu_pump_w'] / 1e3:,.1f} kW",

@@ -63,7 +63,7 @@ def why_command(
     ] = None,
     of: Annotated[
         Literal["inlet", "junction"],
-        typer.Option("--of", help="Explain the inlet, or the junction of a liquid-cooled rack."),
+        typer.Option("--of", help="Explain the inlet, or the junction of a rack with cold plates."),
     ] = "inlet",
     out: Annotated[
         Path | None,
@@ -137,6 +137,7 @@ def _junction_in_run(
     """Simulate a junction of a run again; without step and rack, the hottest one."""
     from sdc_taichi.run.folder_reader import read_configs, read_steps
     from sdc_taichi.run.inlets_of_run import junction_at_step
+    from sdc_taichi.sim.junction_parts import NO_JUNCTIONS
 
     run = _read_run(folder, overrides)
     steps = read_steps(run, range(len(run.names)), ["junction_max_c"])
@@ -144,6 +145,8 @@ def _junction_in_run(
     index = _index_of(run, run.names[int(np.argmax(hottest_c))] if dc is None else dc)
     at_step = int(steps[index]["junction_max_c"].argmax()) if step is None else step
     (config,) = read_configs(run, [index])
+    if not config.plate_racks():
+        raise SdcError(f"{config.name}: {NO_JUNCTIONS}")
     wanted = None if rack is None else parse_rack(rack, config.hall)
     at = "at the end of its hottest step" if step is None else "at the end of step"
     parts = junction_at_step(run, index, at_step, wanted)

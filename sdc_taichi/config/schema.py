@@ -561,6 +561,10 @@ class DataCenterConfig(Section):
         of_racks = enumerate(kinds[name] for name in self.hall.rack_type_names())
         return {rack: liquid for rack, liquid in of_racks if liquid is not None}
 
+    def plate_racks(self) -> dict[int, LiquidRack]:
+        """Return the racks with cold plates by their index in the hall."""
+        return {rack: liquid for rack, liquid in self.liquid_racks().items() if liquid.gpus > 0}
+
     def _given_groups(self) -> dict[str, tuple[ServerGroup, ...]]:
         """Return all configured server groups by the path of their field."""
         types = {f"hall.rack_types.{k}": v.air_servers for k, v in self.hall.rack_types.items()}

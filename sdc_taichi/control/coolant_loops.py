@@ -20,7 +20,7 @@ class LoopReadings(NamedTuple):
     return_c: F64
     """Temperature of the coolant from the racks, in C, (C,)."""
     junction_c: F64
-    """Hottest GPU junction of the racks that the CDU serves, in C, (C,)."""
+    """Hottest GPU junction of the racks that the CDU serves, in C, (C,); 0 without GPUs."""
     headroom_k: F64
     """Smallest throttling limit minus junction of these racks, in K, (C,); inf without GPUs."""
 
@@ -55,7 +55,7 @@ class CoolantLoops:
     def readings(self, last: StepResult | None, state: State) -> LoopReadings:
         """Return the readings of the last step.
 
-        Before the first step all CDUs run, and all temperatures equal their setpoints.
+        Before the first step all CDUs run, and coolant and junctions are at the setpoints.
 
         Args:
             last: result of the last step; None before the first step.
@@ -66,7 +66,8 @@ class CoolantLoops:
         if last is None:
             set_c = state.cdu_setpoint_c
             limits_c = np.minimum.reduceat(self._throttle_c, self._first)[self.cdu_manifold]
-            readings = LoopReadings(np.ones(len(set_c)), set_c, set_c, limits_c - set_c)
+            junction_c = np.where(np.isinf(limits_c), 0.0, set_c)
+            readings = LoopReadings(np.ones(len(set_c)), set_c, junction_c, limits_c - set_c)
         else:
             rate = last.cdu_flow_m3s * self._j_per_m3_k
             rise_k = last.cdu_heat_w / np.where(rate > 0.0, rate, 1.0)

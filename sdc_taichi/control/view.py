@@ -318,7 +318,7 @@ class View:
 
     @property
     def cdu_junction_c(self) -> F64:
-        """Hottest GPU junction of the racks that each CDU serves, in C, (C,)."""
+        """Hottest GPU junction of the racks that each CDU serves, in C, (C,); 0 without GPUs."""
         return self._loop_readings.junction_c
 
     @property

@@ -28,7 +28,7 @@ from sdc_taichi.sim.air import J_PER_KWH, SHORTEST_SUBSTEP_S
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, StepResult
+from sdc_taichi.types import F64, I64, StepResult
 
 Lost = Literal["units", "plant", "liquid"]
 """Kind of loss: CRAC units, devices of the cooling plant, or devices that cool coolant."""
@@ -89,8 +89,7 @@ class Failover:
     config: DataCenterConfig
     """Config of the studied data center, without events."""
     lost: Lost
-    """Kind of the losses. The temperatures of the racks are those of their junctions for losses of
-    liquid cooling, and otherwise of their inlets."""
+    """Kind of the losses."""
     losses: tuple[Loss, ...]
     """The N losses, of which the first is the case without a loss."""
     note: str
@@ -104,13 +103,17 @@ class Failover:
     it_kw: float
     """IT power in the first minute without a loss, in kW."""
     hottest_c: F64
-    """Highest temperature of the racks in each minute, in C, (T, N)."""
+    """Highest temperature of the racks in each minute, in C, (T, N). The temperatures of racks are
+    those of their junctions if ``of_junctions``, and otherwise of their inlets."""
     rack_c: F64
-    """Highest temperature of each rack after ``SHOWN_AFTER_MIN[0]`` minutes, in C, (N, R); 0 for
-    the junctions of racks cooled by air."""
+    """Highest temperature of each rack in minute ``shown_min``, in C, (N, R); 0 for the junctions
+    of racks without cold plates."""
+    shown_min: I64
+    """Minute of ``rack_c``, counted from 1, (N,): that of the hottest rack for losses of liquid
+    cooling, since junctions cool once racks trip, and otherwise ``SHOWN_AFTER_MIN[0]``."""
     throttle_min: F64
-    """Minutes until the first rack throttles or trips, nan if none does, (N,); without liquid
-    cooling to the end of a whole minute."""
+    """Minutes until the first rack throttles or trips, nan if none does, (N,): by inlets to the end
+    of a whole minute, by coolant exactly."""
     trip_min: F64
     """Minutes until the first rack trips, nan if none does, (N,); as ``throttle_min``."""
     racks_off: F64
@@ -121,6 +124,11 @@ class Failover:
     tank_full_min: F64
     """Minutes until warm water fills the stratified buffer tank, nan if it does not or if there is
     no such tank, (N,)."""
+
+    @property
+    def of_junctions(self) -> bool:
+        """True if the temperatures of racks are those of junctions."""
+        return _of_junctions(self.config, self.lost)
 
     @property
     def worst(self) -> list[int]:
@@ -146,7 +154,7 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
 
     Raises:
         ConfigError: The inlet model is ``approach``, which models neither CRAC units nor room air,
-            or no rack is liquid-cooled and losses of liquid cooling are asked for.
+            or no rack has coolant and losses of liquid cooling are asked for.
     """
     base, supply_c = _studied(config)
     losses, note = unit_losses(base) if lost == "units" else (plant_losses(base), "")
@@ -163,6 +171,7 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     ]
     site = load_drivers([config])
     sizing, ones = config.hvac.sizing, np.ones(MINUTES)
+    of_junctions = _of_junctions(config, lost)
     outdoor_c, wet_bulb_c = (
         float(of_site[0]) if configured is None else configured
         for of_site, configured in (
@@ -177,20 +186,25 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
     with Simulator(build_fleet(copies), drivers=drivers) as sim:
         sim.reset()
         tank_most_kwh = sim.sizing.chilled_water.stratified_tank_j / J_PER_KWH
-        results = [_copied(sim.step(), step, lost) for step in range(MINUTES)]
+        steps = ((step, sim.step()) for step in range(MINUTES))
+        results = [_copied(result, step, lost, of_junctions) for step, result in steps]
     throttled, tripped = (np.array([r[name] for r in results]) for name in ("hot", "tripped"))
     throttle_min, trip_min = _first_minute(throttled > 0), _first_minute(tripped > 0)
+    hottest_c = np.array([r["hottest_c"] for r in results])
+    shown = np.full(len(losses), SHOWN_AFTER_MIN[0] - 1)
     if lost == "liquid":
-        throttle_min, trip_min = (
+        by_coolant = [
             _first_time_min(np.array([r[name] for r in results]))
             for name in ("throttle_s", "trip_s")
-        )
-        throttle_min = np.fmin(throttle_min, trip_min)
+        ]
+        trip_min = np.fmin(trip_min, by_coolant[1])
+        throttle_min = np.fmin(np.fmin(throttle_min, by_coolant[0]), trip_min)
+        shown = hottest_c.argmax(axis=0)
     tank_kwh = np.array([r["tank_kwh"] for r in results])
     tank_left = [
         next((e.share for e in loss.events if e.kind == "tank_down"), 1.0) for loss in losses
     ]
-    shown = results[SHOWN_AFTER_MIN[0] - 1]["rack_c"]
+    rack_c = [results[step]["rack_c"].reshape(len(losses), -1)[i] for i, step in enumerate(shown)]
     return Failover(
         config=base,
         lost=lost,
@@ -200,8 +214,9 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
         outdoor_c=outdoor_c,
         wet_bulb_c=wet_bulb_c,
         it_kw=float(results[0]["it_w"][0]) / 1e3,
-        hottest_c=np.array([r["hottest_c"] for r in results]),
-        rack_c=np.asarray(shown).reshape(len(losses), -1),
+        hottest_c=hottest_c,
+        rack_c=np.array(rack_c),
+        shown_min=shown + 1,
         throttle_min=throttle_min,
         trip_min=trip_min,
         racks_off=tripped[-1],
@@ -261,14 +276,15 @@ def liquid_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
     """Return the case without a loss and the losses of liquid cooling, and a note on omitted ones.
 
     Raises:
-        ConfigError: No rack is liquid-cooled.
+        ConfigError: No rack has coolant.
     """
     if config.liquid is None:
         raise ConfigError(
             f"{config.name}: no rack is liquid-cooled; valid are losses of units or of the plant"
         )
     cdus = config.liquid.cdus
-    of_manifold, rack = range(cdus.per_manifold), next(iter(config.liquid_racks()))
+    of_manifold = range(cdus.per_manifold)
+    rack = next(iter(config.plate_racks() or config.liquid_racks()))
     losses = [Loss("no loss", (), ())]
     for kind, text in (("cdu_down", "CDU"), ("cdu_pump_down", "a pump of CDU")):
         for lost in dict.fromkeys((of_manifold[:1], of_manifold)):
@@ -321,11 +337,16 @@ def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
     return with_values(config, values), setpoint_c - over_supply_k
 
 
-def _copied(result: StepResult, step: int, lost: Lost) -> dict[str, Any]:
+def _of_junctions(config: DataCenterConfig, lost: Lost) -> bool:
+    """Return True if losses are judged by junctions: of liquid cooling, in halls with some."""
+    return lost == "liquid" and bool(config.plate_racks())
+
+
+def _copied(result: StepResult, step: int, lost: Lost, of_junctions: bool) -> dict[str, Any]:
     """Return copies of the quantities of a step that a study needs."""
     is_liquid = lost == "liquid"
     values: dict[str, Any] = {
-        "hottest_c": result.junction_max_c if is_liquid else result.inlet_max_c,
+        "hottest_c": result.junction_max_c if of_junctions else result.inlet_max_c,
         "tripped": result.tripped_racks,
         "hot": result.throttled_racks + result.tripped_racks,
         "throttle_s": result.throttle_s,
@@ -335,8 +356,8 @@ def _copied(result: StepResult, step: int, lost: Lost) -> dict[str, Any]:
     }
     if step == 0:
         values["it_w"] = result.it_w
-    if step == SHOWN_AFTER_MIN[0] - 1:
-        values["rack_c"] = result.rack_junction_c if is_liquid else result.rack_inlet_max_c
+    if is_liquid or step == SHOWN_AFTER_MIN[0] - 1:
+        values["rack_c"] = result.rack_junction_c if of_junctions else result.rack_inlet_max_c
     return {name: np.array(each, dtype=np.float64) for name, each in values.items()}
 
 
@@ -378,7 +399,9 @@ def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]
     is_liquid, first = study.lost == "liquid", SHOWN_AFTER_MIN[0]
     times = {"throttle": study.throttle_min, "trip": study.trip_min}
     unit, per_min = ("s", 60.0) if is_liquid else ("min", 1.0)
-    place, water = ("junction", "coolant") if is_liquid else ("inlet", "chilled_water")
+    place, water = "junction" if study.of_junctions else "inlet", "chilled_water"
+    if is_liquid:
+        water = "coolant"
     return [
         {
             "lost": study.losses[i].name,

@@ -266,8 +266,8 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
     Column ``hottest_h`` is the time, in h, during which the rack had the hottest inlet of its hall,
     within ``TIE_K``. Column ``inlet_max_c`` is the highest inlet temperature of the rack, in C.
     Column ``above_27_h`` is the time, in h, during which its hottest inlet was above the
-    recommended 27 C. Data centers with liquid-cooled racks have a column ``junction_c``, the
-    junction temperature in the step of the hottest junction, in C, 0 for racks cooled by air.
+    recommended 27 C. Data centers with cold plates have a column ``junction_c``, the junction
+    temperature in the step of the hottest junction, in C, 0 for racks without cold plates.
 
     Args:
         run: The run.

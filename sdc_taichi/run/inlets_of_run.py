@@ -103,7 +103,7 @@ def junction_at_step(
         allow_code: True if the run's controller may be an import path.
 
     Raises:
-        SdcError: As ``inlets_at_step``, or the rack is not liquid-cooled.
+        SdcError: As ``inlets_at_step``, or the rack has no cold plates.
     """
     with _simulated_to(run, dc, step, allow_code=allow_code) as (sim, _):
         return sim.junction_parts(rack)

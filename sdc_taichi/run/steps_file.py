@@ -32,8 +32,8 @@ The value is a list with one object per data center, whose lists have an entry f
 ``hottest_steps`` is the number of steps in which the rack had the hottest inlet of its hall, within
 ``TIE_K``; ``inlet_max_c`` is the highest inlet temperature of the rack over the run, in C;
 ``above_27_steps`` is the number of steps in which its hottest inlet was above ``RECOMMENDED_C``.
-Data centers with liquid-cooled racks also have ``junction_c``, the junction temperature of each
-rack in the step of the hottest junction, in C, 0 for racks cooled by air.
+Data centers with cold plates also have ``junction_c``, the junction temperature of each rack in the
+step of the hottest junction, in C, 0 for racks without cold plates.
 """
 AIR_KEY = b"sdc_taichi_air"
 """Metadata key of the air before the racks, as JSON.
@@ -199,7 +199,7 @@ class _HottestJunctions:
     def __init__(self, fleet: Fleet) -> None:
         self._racks = [slice(*pair) for pair in pairwise(fleet.rack_offsets.tolist())]
         self._hottest_c = {
-            dc: -np.inf for dc, config in enumerate(fleet.configs) if config.liquid is not None
+            dc: -np.inf for dc, config in enumerate(fleet.configs) if config.plate_racks()
         }
         self._junction_c: dict[int, list[float]] = {}
 

@@ -11,7 +11,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.config.liquid_schema import W_CLASS_LIMITS_C, LiquidConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.drivers import load_drivers
-from sdc_taichi.sim.junction_parts import JunctionParts, junction_parts
+from sdc_taichi.sim.junction_parts import NO_JUNCTIONS, JunctionParts, junction_parts
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult
 from sdc_taichi.sim.liquid_fleet import liquid_fleet
 from sdc_taichi.types import F64
@@ -48,7 +48,7 @@ class DesignLiquid:
         """Split the junction temperature of a rack of the hall; None is the hottest junction.
 
         Raises:
-            SdcError: The rack is not liquid-cooled.
+            SdcError: The rack has no cold plates, or no rack has.
         """
         return junction_parts(self.liquid, self.indices, rack)
 
@@ -57,11 +57,11 @@ def solve_design_liquid(config: DataCenterConfig) -> DesignLiquid:
     """Solve the liquid-cooled racks of a data center at full load in design weather.
 
     Raises:
-        ConfigError: No rack is liquid-cooled.
+        ConfigError: No rack has coolant.
     """
     fleet = liquid_fleet([config])
     if config.liquid is None or fleet is None:
-        raise ConfigError(f"{config.name}: no rack is liquid-cooled; valid is a hall with some")
+        raise ConfigError(f"{config.name}: {NO_JUNCTIONS}")
     site, sizing = load_drivers([config]), config.hvac.sizing
     outdoor_c, wet_bulb_c = (
         float(of_site[0]) if configured is None else configured
@@ -123,13 +123,14 @@ def design_liquid_values(design: DesignLiquid) -> dict[str, Any]:
     result, sizes, cdus = design.result, design.liquid.sizing, design.config.cdus
     setpoint_c = float(result.facility_setpoint_c[0])
     names = (
-        *("liquid_it_w", "liquid_heat_w", "liquid_air_w", "junction_max_c", "cdu_supply_c"),
+        *("liquid_it_w", "liquid_heat_w", "liquid_air_w", "cdu_supply_c"),
         *("cdu_return_c", "facility_supply_c", "facility_return_c", "cdu_pump_w"),
         *("facility_pump_w", "cooler_fan_w", "trim_chiller_w"),
     )
     return {
         "racks": len(design.indices),
         **{name: float(getattr(result, name)[0]) for name in names},
+        "junction_max_c": float(result.junction_max_c[0]) or None,
         "coolant_m3s": float(result.cdu_flow_m3s.sum()),
         "manifolds": cdus.manifolds,
         "cdus_per_manifold": cdus.per_manifold,

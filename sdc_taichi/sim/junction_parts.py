@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from sdc_taichi.errors import SdcError
 from sdc_taichi.sim.liquid import Liquid
 
+NO_JUNCTIONS = (
+    "no rack has cold plates; valid is a hall with liquid-cooled chips, such as preset ai_hall_2026"
+)
+"""Message about the junctions of a hall without any."""
 _SHOWN_K = 0.005
 """Smallest absolute value of a term that is shown although it may be zero, in K."""
 
@@ -65,23 +69,27 @@ def junction_parts(liquid: Liquid, indices: Mapping[int, int], rack: int | None)
         rack: Index of the rack in the hall; None is that of the hottest junction.
 
     Raises:
-        SdcError: The rack is not liquid-cooled.
+        SdcError: The rack has no cold plates, or no rack has.
     """
+    plates = liquid.fleet.has_plates
+    of_plates = {place: index for place, index in indices.items() if plates[index]}
+    if not of_plates:
+        raise SdcError(NO_JUNCTIONS)
     if rack is None:
-        rack = max(indices, key=lambda each: liquid.junction_c[indices[each]])
-    if rack not in indices:
+        rack = max(of_plates, key=lambda each: liquid.junction_c[of_plates[each]])
+    if rack not in of_plates:
         raise SdcError(
-            f"rack {rack}: is cooled by air; valid is a liquid-cooled rack, such as "
-            f"{next(iter(indices))}"
+            f"rack {rack}: has no cold plates; valid is a rack with cold plates, such as "
+            f"{next(iter(of_plates))}"
         )
-    values = liquid.values_of_rack(indices[rack])
+    values = liquid.values_of_rack(of_plates[rack])
     junction_c, coolant_c = values["junction_c"], values["supply_c"]
     facility_c, setpoint_c = values["water_supply_c"], values["wanted_c"]
     resistance = values["capture_chip"] * values["r_k_per_w"]
     design = values["r_fixed_k_per_w"] + values["r_film_k_m3s_per_w"] / values["design_m3s"]
     design *= values["capture_chip"]
     gpu_w = values["gpu_idle_w"] + values["gpu_span_w"] * values["utilisation"]
-    gpu_w *= float(values["runs"] > 0.0 and values["gpus"] > 0.0)
+    gpu_w *= float(values["runs"] > 0.0)
     leakage_w = gpu_w * values["leak_per_k"] * (junction_c - values["leak_ref_c"])
     power_k, flow_k = design * gpu_w, (resistance - design) * gpu_w
     leakage_k = resistance * leakage_w

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
+from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError, SdcError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.air import STATE_AXES, held_air, plain_supply_air, with_entries_of
@@ -23,7 +23,7 @@ from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
-from sdc_taichi.sim.junction_parts import JunctionParts
+from sdc_taichi.sim.junction_parts import NO_JUNCTIONS, JunctionParts
 from sdc_taichi.sim.liquid_halls import LiquidStep, no_liquid_state, with_leaks, without_liquid
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing
@@ -399,11 +399,11 @@ class Simulator:
 
         Raises:
             RuntimeStateError: No step has been done.
-            SdcError: The rack is not liquid-cooled.
+            SdcError: The rack has no cold plates, or no rack has.
         """
         stages = self._started()
         if stages.liquid is None:
-            raise ConfigError(f"{self.fleet.names[dc]}: no rack is liquid-cooled")
+            raise SdcError(NO_JUNCTIONS)
         return stages.liquid.junction_parts(dc, rack)
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
