@@ -419,8 +419,8 @@ class HallQuantities:
 
 
 @dataclass
-class LiquidQuantities:
-    """Liquid cooling in one step; 0 for data centers and racks without it."""
+class LoopQuantities:
+    """Heat, temperatures and power of coolant loops in one step; 0 for data centers without any."""
 
     liquid_heat_w: Annotated[F64, Quantity("W")]
     """Heat of liquid-cooled racks that goes into the coolant."""
@@ -462,9 +462,21 @@ class LiquidQuantities:
     """Water that the cooler of the facility water evaporates and drains; part of ``water_l``."""
     leak_l: Annotated[F64, Quantity("l")]
     """Coolant lost by leaks; part of ``water_l``."""
+
+
+@dataclass
+class LimitedWork:
+    """Work of GPUs with limited power in one step."""
+
     throttled_tasks: Annotated[F64, Quantity("tasks")]
     """Started work that GPUs at their temperature limit or power cap did not complete; it waits in
     the queue again."""
+
+
+@dataclass
+class CduQuantities:
+    """Income, first times and CDUs of coolant loops in one step."""
+
     heat_income: Annotated[F64, Quantity("currency")]
     """Income from delivered heat, in the currency of the tariff."""
     throttle_s: Annotated[F64, Quantity("s")]
@@ -481,6 +493,12 @@ class LiquidQuantities:
     """Heat that each CDU transfers to the facility water."""
     cdu_valve: Annotated[F64, Quantity("1", CDUS)]
     """Flow of facility water through each CDU, divided by its design flow."""
+
+
+@dataclass
+class LiquidQuantities(CduQuantities, LimitedWork, LoopQuantities):
+    """Liquid cooling in one step; 0 for data centers and racks without it."""
+
     rack_junction_c: Annotated[F64, Quantity("C", RACKS)]
     """Junction temperature of the GPUs of each rack; 0 for racks without GPUs on cold plates."""
     rack_liquid_w: Annotated[F64, Quantity("W", RACKS)]

@@ -28,7 +28,7 @@ from sdc_taichi.plant.tower import (
     yorkcalc_reference_water_kg_s,
 )
 from sdc_taichi.plant.water import EVAPORATION_HEAT_J_PER_KG
-from sdc_taichi.types import F64, State, Values
+from sdc_taichi.types import F64, CduQuantities, LoopQuantities, State, Values
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.named_kernel import NamedKernel
@@ -120,63 +120,13 @@ class LiquidInputs:
 
 
 @dataclass
-class LiquidResult:
+class LiquidResult(CduQuantities, LoopQuantities):
     """One step of racks with coolant: temperatures at its end, and means of all else over it."""
 
     liquid_it_w: F64
     """Power of racks with coolant, in W, (B,)."""
-    liquid_heat_w: F64
-    """Heat of servers into the coolant, in W, (B,)."""
-    liquid_air_w: F64
-    """Heat of racks with coolant, their pipes and pumps into the air of the hall, in W, (B,)."""
-    junction_max_c: F64
-    """Hottest junction during the step, in C, (B,); 0 without GPUs."""
-    cdu_supply_c: F64
-    """Coolant that reaches the racks, mean by flow, in C, (B,)."""
-    cdu_return_c: F64
-    """Coolant that returns to the CDUs, mean by flow, in C, (B,)."""
-    facility_supply_c: F64
-    """Facility water that reaches the CDUs, in C, (B,)."""
-    facility_return_c: F64
-    """Facility water that returns to the cooler, in C, (B,)."""
     facility_setpoint_c: F64
     """Setpoint of the facility water, in C, (B,)."""
-    cdu_pump_w: F64
-    """Power of the pumps of CDUs, in W, (B,)."""
-    facility_pump_w: F64
-    """Power of the facility pumps, in W, (B,)."""
-    cooler_fan_w: F64
-    """Power of the fans of cooler or tower, in W, (B,)."""
-    trim_chiller_w: F64
-    """Power of the trim chiller, in W, (B,)."""
-    trim_load_w: F64
-    """Heat that the trim chiller takes, in W, (B,)."""
-    heat_pump_w: F64
-    """Power of the heat pump, in W, (B,)."""
-    reuse_w: F64
-    """Heat delivered to the consumer, in W, (B,)."""
-    liquid_rejected_w: F64
-    """Heat of cooler and trim chiller to the outdoor air, without that of fans, in W, (B,)."""
-    liquid_stored_w: F64
-    """Rate at which chips and loops store heat, in W, (B,)."""
-    cooler_water_l: F64
-    """Evaporation and blowdown of pads or tower, in l, (B,)."""
-    leak_l: F64
-    """Coolant lost by leaks, in l, (B,)."""
-    heat_income: F64
-    """Income from heat, (B,)."""
-    throttle_s: F64
-    """Time from the start of the step to the first throttling, in s, (B,); -1 without."""
-    trip_s: F64
-    """Time from the start of the step to the first trip, in s, (B,); -1 without."""
-    cdu_supply_each_c: F64
-    """Coolant that leaves each CDU, in C, (C,)."""
-    cdu_flow_m3s: F64
-    """Flow of coolant of each CDU at the end of the step, in m3/s, (C,)."""
-    cdu_heat_w: F64
-    """Heat of each CDU into facility water, in W, (C,)."""
-    cdu_valve: F64
-    """Flow of facility water of each CDU, as a share of design, (C,)."""
     it_w: F64
     """Power of each rack with coolant, in W, (L,)."""
     liquid_w: F64
@@ -484,6 +434,8 @@ class Liquid:
             facility_supply_c=states[1],
             facility_return_c=states[0],
             facility_setpoint_c=dc["facility_setpoint_c"],
+            coolant_m3s=self._of_cdus(cdu["m3s"]),
+            facility_m3s=self._of_cdus(cdu["valve"] * self.sizing.cdu_water_m3s),
             cdu_pump_w=dc["cdu_pump_w"],
             facility_pump_w=dc["facility_pump_w"],
             cooler_fan_w=fan_w,
@@ -564,6 +516,11 @@ class Liquid:
     def close(self) -> None:
         """Release the kernel and its arrays."""
         self._kernel = None
+
+    def _of_cdus(self, values: F64) -> F64:
+        """Return the sum of values of the CDUs of each data center, (B,)."""
+        dc = self.fleet.manifold_dc[self.fleet.cdu_manifold]
+        return np.bincount(dc, values, self._size).astype(np.float64)
 
     def _per_dc(self, values: Values) -> F64:
         return np.broadcast_to(values, self._size).astype(np.float64)

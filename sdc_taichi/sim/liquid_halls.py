@@ -25,7 +25,9 @@ from sdc_taichi.types import (
     F64,
     QUANTITIES,
     RACKS,
+    CduQuantities,
     LiquidQuantities,
+    LoopQuantities,
     Reals,
     State,
     fields_of,
@@ -43,7 +45,7 @@ _NAMES = {
 _ALL_NAMES = (*_NAMES[DATA_CENTERS], *_NAMES[CDUS], *_NAMES[RACKS])
 _TIMES = slice(_NAMES[DATA_CENTERS].index("throttle_s"), _NAMES[DATA_CENTERS].index("trip_s") + 1)
 """Rows of the quantities of data centers that are times."""
-_OF_RESULT = {f.name for f in fields(LiquidResult)}
+_OF_LOOPS = tuple(f.name for f in (*fields(LoopQuantities), *fields(CduQuantities)))
 _DEVICES = ("cdu_pump", "facility_pump", "cooler_fan", "trim_chiller", "heat_pump")
 """Devices of liquid cooling with electric power."""
 
@@ -234,13 +236,7 @@ class LiquidHalls:
             share: Share of the step that the results of the model describe, (B,); None for all.
             coolant_flows: Result of ``_coolant_flows``, (L,).
         """
-        values = {
-            name: getattr(result, name) for name in _NAMES[DATA_CENTERS] if name in _OF_RESULT
-        }
-        values |= {name: getattr(result, name) for name in _NAMES[CDUS]}
-        water_m3s = result.cdu_valve * self._model.sizing.cdu_water_m3s
-        for name, flow_m3s in (("coolant_m3s", result.cdu_flow_m3s), ("facility_m3s", water_m3s)):
-            values[name] = np.bincount(self._fleet.cdu_dc, flow_m3s, self._fleet.size)
+        values = {name: getattr(result, name) for name in _OF_LOOPS}
         it_w, liquid_w, lost = result.it_w, result.liquid_w, result.lost_utilisation
         if share is not None:
             of_axis = {DATA_CENTERS: share, CDUS: share[self._fleet.cdu_dc]}
