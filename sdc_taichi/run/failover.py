@@ -189,7 +189,9 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
         steps = ((step, sim.step()) for step in range(MINUTES))
         results = [_copied(result, step, lost, of_junctions) for step, result in steps]
     throttled, tripped = (np.array([r[name] for r in results]) for name in ("hot", "tripped"))
-    throttle_min, trip_min = _first_minute(throttled > 0), _first_minute(tripped > 0)
+    # A rack whose cold plates leak is off at once.
+    leaks = np.array([sum(e.kind == "leak" for e in loss.events) for loss in losses]) * of_junctions
+    throttle_min, trip_min = (_first_minute(count > leaks) for count in (throttled, tripped))
     hottest_c = np.array([r["hottest_c"] for r in results])
     shown = np.full(len(losses), SHOWN_AFTER_MIN[0] - 1)
     if lost == "liquid":
