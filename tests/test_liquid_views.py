@@ -296,6 +296,8 @@ def test_a_hall_with_rear_doors_alone_has_no_junctions(tmp_path: Path) -> None:
     assert not any("junction" in entity for entity in entities)
     run = read_run(tmp_path / "run")
     assert "junction_c" not in read_racks(run, [0])[0]
+    (steps,) = read_steps(run, [0])
+    np.testing.assert_allclose(steps["cdu_supply_c"], 22.0, err_msg="the reset holds setpoints")
     html = report_html(run)
     section = html[html.index("Liquid cooling of ai</h2>") :].partition("</section>")[0]
     assert section.count("<figure>") == 2

@@ -148,7 +148,8 @@ class ScheduledEvent(Section):
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
     litres: Litres | None = None
-    """Coolant that a leak loses in its first step, in l; the rack stays off until it ends."""
+    """Coolant that a leak loses in its first step, in l. Until it ends, a rack with cold plates is
+    off, and a rear door takes no heat."""
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> Self:
@@ -176,7 +177,8 @@ class SampledEvent(Section):
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
     litres: Litres | None = None
-    """Coolant that a leak loses in its first step, in l; the rack stays off until it ends."""
+    """Coolant that a leak loses in its first step, in l. Until it ends, a rack with cold plates is
+    off, and a rear door takes no heat."""
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> Self:

@@ -45,7 +45,8 @@ class JunctionReset(WithoutMemory):
     """Supply setpoints by trim and respond on the hottest junction of the racks of each CDU.
 
     In each step the setpoint of a CDU rises by 0.2 K while its racks have more than 10 K of
-    headroom to throttling, and falls by half of what is missing of them.
+    headroom to throttling, and falls by half of what is missing of them. CDUs without GPUs, such as
+    those of rear doors, hold theirs.
     """
 
     commands = ("cdu_setpoint_c",)
@@ -55,6 +56,7 @@ class JunctionReset(WithoutMemory):
         """Return commands for setpoints alone."""
         missing_k = np.maximum(TARGET_HEADROOM_K - view.cdu_headroom_k, 0.0)
         change_k = np.where(missing_k > 0.0, -RESPOND_PER_K * missing_k, TRIM_K)
+        change_k[np.isinf(view.cdu_headroom_k)] = 0.0
         if view.last is None:
             change_k = np.zeros_like(change_k)
         return Actions(
