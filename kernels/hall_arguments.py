@@ -28,10 +28,10 @@ LANE_BITS = LANES.bit_length() - 1
 """Binary logarithm of LANES."""
 DENSE_LANES = 4
 """Source racks in one vector of weights of dense halls; it serves all lanes of a block."""
-RUN_LANES = 16
-"""Source racks in one vector of weights of sparse halls; it has weights for one rack."""
-RUN_BLOCKS = RUN_LANES // LANES
-"""Blocks per vector of RUN_LANES racks."""
+SPARSE_LANES = 16
+"""Source racks in one vector of weights of sparse halls; it serves all lanes of a block."""
+SPARSE_BLOCKS = SPARSE_LANES // LANES
+"""Blocks per vector of SPARSE_LANES racks."""
 CHUNK_BLOCKS = 16
 """Maximum number of blocks in a chunk; fewer racks do not justify a thread."""
 RANKS_PER_K = 2.0**27
@@ -61,10 +61,9 @@ PLACE_INTS = {
     "first_server": "first server of the rack",
 }
 """Padding, and the closing entry, point to the end of the last rack before them."""
-RUN_INTS = {
-    "first_source": "first vector of RUN_LANES racks whose exhausts the run weights",
-    "length": "number of vectors in the run",
-    "first_weight": "first vector in run_weights",
+SOURCE_INTS = {
+    "vector": "vector of SPARSE_LANES racks whose exhausts reach a block of a sparse hall",
+    "weights": "entry in sparse_weights",
 }
 CHUNK_INTS = {
     "first_block": "first block of the chunk",
@@ -366,8 +365,8 @@ ARGUMENTS = {
     "chunk_ints": _numbers("i32", 2, CHUNK_INTS, "chunks"),
     "block_ints": _numbers("i32", 2, BLOCK_INTS, "blocks"),
     "place_ints": _numbers("i32", 2, PLACE_INTS, "places"),
-    "run_offsets": _numbers("i32", 1),  # first run of weights of each place, and the final end
-    "run_ints": _numbers("i32", 2, RUN_INTS, "runs"),
+    "source_offsets": _numbers("i32", 1),  # first source of each block, and the final end
+    "source_ints": _numbers("i32", 2, SOURCE_INTS, "sources"),
     # Halls, and their boundary conditions.
     "dc_coefficients": _numbers("real", 1, DC_COEFFICIENTS, "dcs"),
     "server_knees": _numbers("real", 2, KNEES, "knees"),
@@ -377,7 +376,7 @@ ARGUMENTS = {
     "group_load": _numbers("real", 1),  # utilisation of each group, if given per group
     "unit_shares": _vectors(1),  # present share of each unit in a rack's supply, s of docs/hall.md
     "mix_weights": _vectors(1, lanes=DENSE_LANES * LANES),  # of dense halls
-    "run_weights": _vectors(1, lanes=RUN_LANES),  # of sparse halls
+    "sparse_weights": _vectors(1, lanes=SPARSE_LANES * LANES),  # of sparse halls
     "steady_states": _vectors(1),  # patterns or modes of each hall, and what gives their amounts
     "sample_outlet_c": _numbers("real", 1),  # outlets of the sampled racks of sparse halls
     # State that is carried from sweep to sweep.
@@ -386,7 +385,7 @@ ARGUMENTS = {
     "unit_state": _numbers("f64", 2, UNIT_STATE, "units"),
     "rack_state": _vectors(2, RACK_STATE, "blocks"),
     "rack_state_by_4": _vectors(1, lanes=DENSE_LANES),  # rack_state as vectors of 4 lanes
-    "rack_state_by_16": _vectors(1, lanes=RUN_LANES),  # rack_state as vectors of 16 lanes
+    "rack_state_by_16": _vectors(1, lanes=SPARSE_LANES),  # rack_state as vectors of 16 lanes
     "server_c": _vectors(1),  # server temperatures of transient halls, by block and group
     "server_c_before": _numbers("real", 1),  # group temperatures at step start
     "server_c_after": _numbers("real", 1),  # group temperatures at step end
@@ -422,7 +421,14 @@ _LAYERS_ALONE = (
 _STEP_ALONE = (
     *("sweeps", "load_columns", "substep_s", "weight", "tolerance_k", "abandoned_above_k"),
     "task_offsets",
-    *("run_offsets", "run_ints", "unit_inputs", "mix_weights", "run_weights", "steady_states"),
+    *(
+        "source_offsets",
+        "source_ints",
+        "unit_inputs",
+        "mix_weights",
+        "sparse_weights",
+        "steady_states",
+    ),
     *("sample_outlet_c", "mode_amounts", "mode_amount"),
     *("dc_control", "rack_state_by_4", "rack_state_by_16", "server_c_before", "server_c_after"),
     *("scratch", "unit_need_m3s", "unit_plain_m3s", "plenum_shares", "plenum_need", "unit_lanes"),

@@ -35,9 +35,9 @@ from .hall_arguments import (
     N_BLOCK_TERMS,
     NOT_CONVERGED,
     RACK_STATE,
-    RUN_BLOCKS,
-    RUN_LANES,
     RUNNING,
+    SPARSE_BLOCKS,
+    SPARSE_LANES,
 )
 from .sums import store_change_range
 
@@ -184,28 +184,19 @@ def dense_mix(hall: ti.template(), weight_at, source_at, count):
 @ti.func
 @no_type_check
 def sparse_mix(hall: ti.template(), block_at, side):
-    """Return the exhaust mix before the racks of a block of a sparse hall, summed over runs."""
+    """Return the exhaust mix before the racks of a block of a sparse hall, in C."""
+    sums = ti.Vector([ti.cast(0.0, hall.real)] * (SPARSE_LANES * LANES))
+    vector_0 = (EXHAUST_ROW + side) * hall.rack_state.shape[1] // SPARSE_BLOCKS
+    at = hall.source_offsets[block_at]
+    while at < hall.source_offsets[block_at + 1]:
+        x = hall.rack_state_by_16[vector_0 + hall.sources[at].vector]
+        sums += hall.sparse_weights[hall.sources[at].weights] * ti.Vector(
+            [x[i // LANES] for i in ti.static(range(SPARSE_LANES * LANES))]
+        )
+        at += hall.one
     mix_c = hall.zeros
-    source_0 = (EXHAUST_ROW + side) * hall.rack_state.shape[1] // RUN_BLOCKS
-    lane = 0
-    while lane < LANES:
-        at = block_at * LANES + lane
-        parts = ti.Vector([ti.cast(0.0, hall.real)] * RUN_LANES)
-        run = hall.run_offsets[at]
-        while run < hall.run_offsets[at + 1]:
-            x = source_0 + hall.runs[run].first_source
-            w = hall.runs[run].first_weight
-            end = w + hall.runs[run].length
-            while w < end:
-                parts += hall.run_weights[w] * hall.rack_state_by_16[x]
-                w += hall.one
-                x += hall.one
-            run += hall.one
-        total = hall.real(0.0)
-        for j in range(RUN_LANES):
-            total += parts[j]
-        mix_c[lane] = total
-        lane += hall.one
+    for source in ti.static(range(SPARSE_LANES)):
+        mix_c += ti.Vector([sums[source * LANES + i] for i in ti.static(range(LANES))])
     mix_c *= hall.blocks[block_at].norm
     return mix_c
 

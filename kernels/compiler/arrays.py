@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-ALIGNMENT = 512
+ALIGNMENT = 1024
 """Alignment in bytes: compiled code expects an array of vectors to start at a multiple of the
 vector's length."""
 F64_LANES = 8

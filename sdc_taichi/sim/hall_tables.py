@@ -38,10 +38,10 @@ from sdc_taichi.kernels.hall_arguments import (
     RACK_OUT,
     RACK_STATE,
     RETURN_AIR,
-    RUN_BLOCKS,
-    RUN_INTS,
-    RUN_LANES,
     SCRATCH,
+    SOURCE_INTS,
+    SPARSE_BLOCKS,
+    SPARSE_LANES,
     SUMS,
     UNIT_INPUTS,
     UNIT_STATE,
@@ -170,7 +170,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "chunk_ints": chunk_ints,
         "block_ints": block_ints,
         "place_ints": place_ints,
-        **_build_runs(fleet, places, dtype),
+        **_build_sources(fleet, places, dtype),
         "dc_coefficients": np.array(fleet.dcs.T, dtype, order="C").reshape(-1),
         "rack_inputs": _build_rack_inputs(fleet, places, dtype),
         "server_knees": server_knees,
@@ -185,7 +185,7 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "unit_state": np.ones((len(UNIT_STATE), fleet.units)),
         "rack_state": rack_state,
         "rack_state_by_4": rack_state.reshape(-1, DENSE_LANES),
-        "rack_state_by_16": rack_state.reshape(-1, RUN_LANES),
+        "rack_state_by_16": rack_state.reshape(-1, SPARSE_LANES),
         "scratch": vectors(dtype, slices * SCRATCH),
         "mode_amounts": mode_amounts,
         "mode_amount": mode_amounts.reshape(-1),
@@ -217,8 +217,8 @@ def _build_places(fleet: Fleet) -> RackPlaces:
     racks = np.diff(fleet.rack_offsets)
     blocks = -(-racks // LANES)
     if fleet.air is not None and racks.max() > DENSE_RACKS:
-        # Runs of weights are read as vectors of RUN_LANES, so halls must begin at such a vector.
-        blocks = -(-blocks // RUN_BLOCKS) * RUN_BLOCKS
+        # Exhausts are read as vectors of SPARSE_LANES, so halls must begin at such a vector.
+        blocks = -(-blocks // SPARSE_BLOCKS) * SPARSE_BLOCKS
     block_offsets = offsets_from_counts(blocks, "blocks of racks")
     within = np.arange(fleet.racks) - np.repeat(fleet.rack_offsets[:-1], racks)
     return RackPlaces(
@@ -407,7 +407,7 @@ def _build_air(
 ) -> tuple[Array, Array, Array]:
     """Return unit shares by block, mix weights of dense halls, and each hall's first weight.
 
-    The first weight is -1 for sparse halls, whose weights are in runs (see ``_build_runs``).
+    The first weight is -1 for sparse halls, whose weights are apart (see ``_build_sources``).
     """
     first_mix_weight = np.full(fleet.size + 1, -1)
     air = fleet.air
@@ -472,7 +472,7 @@ def _shares_by_block(fleet: Fleet, places: RackPlaces, flat_shares: F64) -> list
         at = fleet.air.unit_share_offsets[dc]
         of_hall = flat_shares[at : at + racks * units].reshape(racks, units)
         shares.append(shares_by_block(of_hall, LANES))
-        # Sparse halls are padded with blocks of zeros to whole vectors of RUN_LANES.
+        # Sparse halls are padded with blocks of zeros to whole vectors of SPARSE_LANES.
         shares.append(np.zeros((int(places.blocks[dc]) * units - len(shares[-1]), LANES)))
     return shares
 
@@ -568,47 +568,69 @@ def _amounts_with_margin(table: SteadyStateTable) -> Array:
     return np.pad(amounts, beyond, mode="reflect", reflect_type="odd").reshape(-1, LANES)
 
 
-def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[str, Array]:
-    """Return the runs of mix weights of sparse halls, padded with zeros to whole vectors."""
-    air = fleet.air
-    run_counts = np.zeros(places.count, np.int64)
+def _build_sources(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[str, Array]:
+    """Return the mix weights of sparse halls by block of racks and vector of source racks."""
+    air, n_blocks = fleet.air, places.count // LANES
     is_sparse = np.diff(fleet.rack_offsets)[fleet.rack_dc] > DENSE_RACKS
     if air is None or not is_sparse.any():
         return {
-            "run_offsets": offsets_from_counts(run_counts, "runs of weights"),
-            "run_ints": np.zeros((len(RUN_INTS), 1), np.int32),
-            "run_weights": vectors(dtype, 1, lanes=RUN_LANES),
+            "source_offsets": np.zeros(n_blocks + 1, np.int32),
+            "source_ints": np.zeros((len(SOURCE_INTS), 1), np.int32),
+            "sparse_weights": vectors(dtype, 1, lanes=SPARSE_LANES * LANES),
         }
     mix_weights = air.mix_weights
     counts = np.diff(mix_weights.run_offsets)
-    run_counts[places.of_racks[is_sparse]] = counts[is_sparse]
-    of_sparse = np.repeat(is_sparse, counts)
+    of_sparse = np.repeat(is_sparse, counts) & (mix_weights.run_length > 0)
     moved = places.of_racks[fleet.rack_offsets[:-1]] - fleet.rack_offsets[:-1]
     first = (mix_weights.run_first_rack + np.repeat(moved[fleet.rack_dc], counts))[of_sparse]
     length = mix_weights.run_length[of_sparse]
     offset = mix_weights.run_first_weight[of_sparse].astype(np.int64)
-    # Runs with equal weights share vectors if they begin at the same lane.
-    lane = first % RUN_LANES
-    key = (offset * (int(length.max()) + 1) + length) * RUN_LANES + lane
+    # Weights of a single rack, as vectors. Runs with equal weights share vectors if they begin at
+    # the same lane.
+    lane = first % SPARSE_LANES
+    key = (offset * (int(length.max()) + 1) + length) * SPARSE_LANES + lane
     _, one, same = np.unique(key, return_index=True, return_inverse=True)
-    n_vectors = -(-(lane + length) // RUN_LANES)
-    first_weight = offsets_from_counts(n_vectors[one], "vectors of weights")
-    weights = vectors(dtype, int(first_weight[-1]), lanes=RUN_LANES)
-    within = np.arange(int(length[one].sum()))
-    within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
-    to = np.repeat(first_weight[:-1].astype(np.int64) * RUN_LANES + lane[one], length[one]) + within
-    from_place = np.repeat(offset[one], length[one]) + within
-    weights.reshape(-1)[to] = mix_weights.weights[from_place]
-    runs = {
-        "first_source": first // RUN_LANES,
-        "length": n_vectors,
-        "first_weight": first_weight[same],
-    }
+    n_vectors = -(-(lane + length) // SPARSE_LANES)
+    # Vector 0 is that of a rack without weights.
+    first_vector = 1 + offsets_from_counts(n_vectors[one], "vectors of weights").astype(np.int64)
+    of_rack = np.zeros((int(first_vector[-1]), SPARSE_LANES))
+    within = _positions(length[one])
+    to = np.repeat(first_vector[:-1] * SPARSE_LANES + lane[one], length[one]) + within
+    of_rack.reshape(-1)[to] = mix_weights.weights[np.repeat(offset[one], length[one]) + within]
+    # Vectors of the racks of a block that have the same sources.
+    within = _positions(n_vectors)
+    place = np.repeat(np.repeat(places.of_racks, counts)[of_sparse], n_vectors)
+    source = np.repeat(first // SPARSE_LANES, n_vectors) + within
+    # Neighbouring runs of a rack may share a vector, which then has two entries.
+    at = np.arange(len(place))
+    follows = np.zeros(len(place), np.bool_)
+    follows[1:] = (place[1:] == place[:-1]) & (source[1:] == source[:-1])
+    repeated = at - np.maximum.accumulate(np.where(follows, 0, at))
+    copies = int(repeated.max()) + 1
+    entry = (place // LANES * np.int64(n_blocks) + source) * copies + repeated
+    entries, entry = np.unique(entry, return_inverse=True)
+    block, source = np.divmod(entries // copies, n_blocks)
+    of_lane = np.zeros((len(entries), LANES), np.int64)
+    of_lane[entry, place % LANES] = np.repeat(first_vector[:-1][same], n_vectors) + within
+    # Entries with equal weights share them.
+    shared = np.zeros(len(entries), np.int64)
+    for vector in of_lane.T:
+        _, one, shared = np.unique(
+            shared * len(of_rack) + vector, return_index=True, return_inverse=True
+        )
+    weights = vectors(dtype, len(one), lanes=SPARSE_LANES * LANES)
+    weights.reshape(-1, SPARSE_LANES, LANES)[:] = of_rack[of_lane[one]].swapaxes(1, 2)
+    per_block = np.bincount(block, minlength=n_blocks)
     return {
-        "run_offsets": offsets_from_counts(run_counts, "runs of weights"),
-        "run_ints": _index_rows(RUN_INTS, runs),
-        "run_weights": weights,
+        "source_offsets": offsets_from_counts(per_block, "sources of blocks"),
+        "source_ints": _index_rows(SOURCE_INTS, {"vector": source, "weights": shared}),
+        "sparse_weights": weights,
     }
+
+
+def _positions(counts: Array) -> Array:
+    """Return the position of each item within its group, for groups of ``counts`` items."""
+    return np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> Array:
