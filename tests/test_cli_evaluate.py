@@ -104,6 +104,19 @@ def test_without_an_optimum_there_is_no_share(runs: Path, monkeypatch: pytest.Mo
     assert json.loads(asked.stdout)["summary"] == content["summary"]
 
 
+def test_loads_by_zone_have_no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "solve", None)
+    zones = ("--set", "workload.zone_loads={}", "--set", "workload.placement=weights")
+    done = call("--controller", "g36", *CASE, *zones, "--json")
+    assert done.exit_code == 0, done.output
+    (note,) = done.stderr.splitlines()
+    assert note.startswith("note: no optimum, so no shares: ")
+    assert "workload.zone_loads" in note
+    summary = json.loads(done.stdout)["summary"]
+    assert [row["controller"] for row in summary] == ["idle", "g36"]
+    assert [row["share_pct"] for row in summary] == [None, None]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -96,7 +96,8 @@ def evaluate_command(
     """Compare policies and controllers in weeks that no training has seen.
 
     All begin in equal weeks and states; the first day of each week is run but not scored. The share
-    of the achievable is 0 for idle commands and 1 for the known optimum.
+    of the achievable is 0 for idle commands and 1 for the known optimum. Halls with loads by zone
+    have no known optimum, and therefore no shares.
     """
     from sdc_taichi.learning.evaluation import check_contenders, training_settings
     from sdc_taichi.learning.evaluation_table import (
@@ -109,6 +110,7 @@ def evaluate_command(
         write_evaluation,
     )
     from sdc_taichi.learning.split import parse_weeks
+    from sdc_taichi.optimum.problem import require_traces
     from sdc_taichi.sim.fleet import build_fleet
 
     folders, named = list(runs or ()), list(controller or ())
@@ -125,7 +127,15 @@ def evaluate_command(
         objective = "carbon" if settings is None else settings.validation.objective
     # Invalid names and policies must fail before solving for the optimum, which may take hours.
     with warnings.catch_warnings(action="ignore"):
-        check_contenders(_contenders(build_fleet(configs), folders, named))
+        fleet = build_fleet(configs)
+        check_contenders(_contenders(fleet, folders, named))
+    seeks_optimum = not no_optimum
+    if seeks_optimum:
+        try:
+            require_traces(fleet)
+        except ConfigError as error:
+            _note_missing_optimum(error)
+            seeks_optimum = False
     if out is not None:
         prepare_evaluation_folder(out, force=force)
     with interruptible() as stop:
@@ -133,7 +143,7 @@ def evaluate_command(
             prepared = _prepared(
                 configs,
                 chosen,
-                optimum=not no_optimum,
+                optimum=seeks_optimum,
                 exact_ends=exact_ends,
                 objective=objective,
                 days=days,
@@ -163,7 +173,7 @@ def evaluate_command(
         left = ", ".join(evaluation.missing)
         print(f"interrupted; figures are whole, without {left}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED)
-    if prepared.optimum is None and not no_optimum:
+    if prepared.optimum is None and seeks_optimum:
         raise SdcError(
             "evaluate: no optimum, so no shares; valid without an optimum is --no-optimum"
         )
@@ -210,8 +220,13 @@ def _prepared(
                 raise
             failed = error
         weeks_without = prepare(configs, weeks, optimum=False, stop=stop, **options)
-    print(f"note: no optimum, so no shares: {one_line(str(failed))}", file=sys.stderr)
+    _note_missing_optimum(failed)
     return weeks_without
+
+
+def _note_missing_optimum(reason: SdcError) -> None:
+    """Print on stderr why there is no optimum."""
+    print(f"note: no optimum, so no shares: {one_line(str(reason))}", file=sys.stderr)
 
 
 def _evaluated(
