@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
@@ -158,14 +159,18 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         ``zone_heat_k_h``.
         """
         masks, heat_k_h = self.core.masks(), self.core.zone_heat_k_h()
+        differ = any(values.ndim > 1 for values in infos.values())
+        shared = {} if differ else as_scalars(infos)
         by_agent: dict[str, dict[str, Any]] = {}
         for group, names in self._groups.items():
+            acts = masks[group][0].astype(np.int64).tolist() if group in masks else None
+            of_zones = heat_k_h[group][0].tolist() if group in heat_k_h else None
             for i, agent in enumerate(names):
-                by_agent[agent] = as_scalars(infos, i)
-                if group in masks:
-                    by_agent[agent]["acts"] = int(masks[group][0, i])
-                if group in heat_k_h:
-                    by_agent[agent]["zone_heat_k_h"] = float(heat_k_h[group][0, i])
+                by_agent[agent] = of_agent = as_scalars(infos, i) if differ else shared.copy()
+                if acts is not None:
+                    of_agent["acts"] = acts[i]
+                if of_zones is not None:
+                    of_agent["zone_heat_k_h"] = of_zones[i]
         return by_agent
 
 

@@ -208,7 +208,16 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
     weighted = count * weight
     level = _ratio(work, bins.sums(weighted))
     load = level[bins.dc] * weight
-    if np.all((load < capacity * CLEARLY_BELOW) | (weight == 0.0)):
+    fits = (load < capacity * CLEARLY_BELOW) | (weight == 0.0)
+    fits_all = np.logical_and.reduceat(fits, bins.offsets[:-1])
+    if np.all(fits_all):
+        return load
+    if np.any(fits_all):
+        # Most data centers of a batch usually have no full bins, which take most of the time.
+        some = ~fits_all[bins.dc]
+        load[some] = _in_proportion(
+            weight[some], work[~fits_all], _part(bins, ~fits_all), count[some], capacity[some]
+        )
         return load
     room = count * capacity
     level_full = capacity / np.where(weight > 0.0, weight, 1.0)
@@ -220,6 +229,11 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
     rest = work - bins.sums(np.where(full, room, 0.0))
     level = _ratio(rest, bins.sums(np.where(full, 0.0, weighted)))
     return np.where(full, capacity, np.clip(level[bins.dc] * weight, 0.0, capacity))
+
+
+def _part(bins: Bins, chosen: Mask) -> Bins:
+    """Return the bins of the chosen data centers, (B,)."""
+    return make_bins(np.append(0, np.cumsum(np.diff(bins.offsets)[chosen])))
 
 
 def _ratio(work: F64, weight: F64) -> F64:
