@@ -165,10 +165,11 @@ def _plan_queue(plan: ti.template(), dc, peak_kwh):
 @ti.func
 @no_type_check
 def _follow_queue(plan: ti.template(), dc):
-    """Store the energy of the facility in each step under the planned commands."""
+    """Store work and energy of the facility in each step under the planned commands."""
     chosen = plan.chosen[dc]
     waiting = plan.first_waiting[dc, chosen]
     _read_map(plan, dc, 0)
+    plan.executed[dc, 0] = plan.first_executed[dc, chosen]
     plan.facility_kwh[dc, 0] = _kwh_of(plan, dc, plan.first_executed[dc, chosen])
     for k in range(1, plan.horizon):
         _read_map(plan, dc, k)
@@ -177,6 +178,7 @@ def _follow_queue(plan: ti.template(), dc):
         command = plan.commands[plan.policy[dc, k, ti.min(place, plan.levels - 1)]]
         executed, left, _ = _work_step(plan, dc, at, command, waiting)
         waiting = left
+        plan.executed[dc, k] = executed
         plan.facility_kwh[dc, k] = _kwh_of(plan, dc, executed)
 
 

@@ -69,6 +69,7 @@ QUEUE_ARGUMENTS = {
     "first_executed": Argument("f64", 2),  # executed work of each candidate, in tasks, (B, C)
     "first_waiting": Argument("f64", 2),  # queue after each candidate, in tasks, (B, C)
     "first_late": Argument("f64", 2),  # dropped work of each candidate, in tasks, (B, C)
+    "executed": Argument("f64", 2),  # executed work of each step of the plan, in tasks, (B, H)
 }
 """Arguments of the kernel of ``queue_kernel``."""
 STORE_ARGUMENTS = {

@@ -59,6 +59,7 @@ def made_up_optimum(
         load=np.zeros(shape),
         cooling=cooling,
         battery=battery,
+        loops=None,
         bound_of_ends=bound_of_ends,
     )
 

@@ -112,7 +112,7 @@ def test_simulate_tells_its_share(asked: dict[str, Any], tmp_path: Path) -> None
         (["--objective", "carbn"], "did you mean 'carbon'"),
         (["--objective", "-1*carbon"], "weight -1 of carbon"),
         (["--agents", "load,cool"], "--agents 'load,cool': 'cool'; valid are load, cooling"),
-        (["--agents", "load", "--uncoordinated"], "valid is with two or more agents"),
+        (["--agents", "load", "--uncoordinated"], "valid is with two or more of load"),
         (["--agents", "load,load"], "load is given twice"),
         (["--warm-up", "1"], "--warm-up 1: valid is less than --days"),
         (["--warm-up", "0.001"], "--warm-up 0.001: valid is a positive number of days"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -17,17 +18,21 @@ import sdc_taichi
 from policies import policy
 from sdc_taichi import Actions, ConfigError, load_config, make_controller
 from sdc_taichi.control import commands_of
+from sdc_taichi.control.mpc import _loop_commands
+from sdc_taichi.control.plans import EnergyCost, QueuePlan, Weather
 from sdc_taichi.envs.agents import TEAM_OF_LIQUID
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.learning.interface import interface_of
-from sdc_taichi.optimum.loop_map import LoopCommands
-from sdc_taichi.optimum.loop_optimum import loop_optimum
+from sdc_taichi.optimum import solve
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS, LoopCommands
 from sdc_taichi.optimum.objective import Objective, Score
-from sdc_taichi.sim.bills import with_prices
-from sdc_taichi.sim.drivers import load_drivers
+from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS
+from sdc_taichi.run.achievable import AchievedPath, run_beside
+from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
+from sdc_taichi.types import F64
 
 HALL_ENV: Any = sdc_taichi.hall_env
 VECTOR_ENV: Any = sdc_taichi.vector_env
@@ -294,15 +299,21 @@ def test_no_steady_commands_beat_those_of_the_tables() -> None:
 
 
 def test_no_run_beats_the_optimum_of_coolant_loops() -> None:
+    """Random commands of the loops, and all of load, setpoint, battery and loops together."""
     config = hall("site.start=07-20")
-    fleet = build_fleet(config)
-    drivers = with_prices(load_drivers(fleet.configs), fleet.configs)
-    energy = Objective.parse("energy")
-    best = loop_optimum(fleet, drivers, start=drivers.start, steps=24, objective=energy)
+    loops, joint = (
+        solve(config, steps=24, objective="energy", agents=agents, cache=False)
+        for agents in (("liquid",), None)
+    )
+    assert joint.agents == ALL_AGENTS
+    assert loops.bound_kinds == joint.bound_kinds == ("bound",)
+    assert loops.bound[0] <= loops.achieved[0] < 0.995 * loops.idle[0]
+    assert joint.bound[0] <= joint.achieved[0] <= min(joint.alone.values())[0]
+    assert joint.alone["liquid"] == loops.achieved
     rng = np.random.default_rng(0)
     with Simulator([config] * 16, precision="f64") as sim:
         sim.reset(0)
-        score = Score(energy, sim)
+        score = Score(Objective.parse("energy"), sim)
         lost = np.zeros(16)
         goals = rng.uniform([[24.0], [0.4], [2.0]], [[45.0], [1.1], [8.0]], (3, 16))
         for _ in range(24):
@@ -316,11 +327,76 @@ def test_no_run_beats_the_optimum_of_coolant_loops() -> None:
             )
             score.add(result)
             lost += result.throttled_tasks
-    assert best.bound <= best.achieved
-    assert best.achieved < 0.995 * best.idle
-    assert score.figure[lost == 0.0].min() > best.bound
-    with pytest.raises(ConfigError, match="no optimum of coolant loops in transient halls"):
-        loop_optimum(build_fleet(DOWN), drivers, start=drivers.start, steps=24, objective=energy)
+    assert score.figure[lost == 0.0].min() > loops.bound[0]
+    with Simulator(config) as sim:
+        reached = run_beside(joint, sim, AchievedPath(joint), "optimum")
+        assert reached is not None
+        np.testing.assert_allclose(reached.figure, joint.achieved, rtol=1e-9)
+        assert not any(reached.broken)
+
+
+def test_optima_that_hold_or_cannot_bound_coolant_loops() -> None:
+    """Held loops have a bound of their own; drawn failures are in the simulated path."""
+    held = solve(hall(), steps=8, objective="energy", agents=("cooling",), cache=False)
+    assert held.loops is None
+    assert held.bound_kinds == ("bound",)
+    drawn = "events.sampled=[{kind: cdu_down, per_year: 4000, duration_h: [1, 2]}]"
+    first, second = (
+        solve(hall(drawn), steps=8, seed=seed, objective="energy", agents=("liquid",), cache=False)
+        for seed in (0, 1)
+    )
+    assert first.bound_kinds[0].startswith("none: sampled events")
+    assert first.idle != second.idle
+    water = solve(hall(), steps=4, objective="water", agents=("liquid",), cache=False)
+    assert "not of least water" in water.bound_kinds[0]
+    with pytest.raises(ConfigError, match="valid is one or more of load, cooling, battery, each"):
+        solve(load_config("tiny"), steps=4, agents=("liquid",), cache=False)
+
+
+def test_plans_move_setpoints_before_the_load_does() -> None:
+    """The best setpoint rises from 30 to 38 C, and setpoints move by 2 K a step."""
+
+    class Tables:
+        def of(self, dc: int) -> Tables:
+            return self
+
+        def at(self, outdoor_c: F64, wet_bulb_c: F64, utilisation: F64) -> F64:
+            return np.array([30.0 + 8.0 * utilisation, 0.6 + 0.0 * outdoor_c, 4.0 + utilisation])
+
+    fleet = build_fleet(hall(manifolds=1))
+    state = SimpleNamespace(cdu_setpoint_c=np.full(fleet.cdus, 30.0))
+    view: Any = SimpleNamespace(fleet=fleet, size=1, state=state)
+
+    def setpoint_c(*load: float) -> float:
+        steps = np.zeros((1, len(load)))
+        work = QueuePlan(np.zeros(1), 100.0 * np.array([load]), steps)
+        cost = EnergyCost(steps + 1.0, np.zeros(1), np.zeros(1))
+        given = _loop_commands(view, cast("Any", Tables()), Weather(steps, steps), work, cost)
+        assert given["cdu_flow"] == pytest.approx(0.6)
+        assert given["facility_approach_k"] == pytest.approx(4.0 + load[0])
+        return float(given["cdu_setpoint_c"][0])
+
+    # Squared distances: 2^2 + 4^2 + 2^2 with a first step of 2 K, 0 + 6^2 + 4^2 + 2^2 without.
+    assert setpoint_c(0.0, 1.0, 1.0) == pytest.approx(32.0)
+    assert setpoint_c(0.0, 0.0, 0.0, 0.1) == 30.0
+    assert setpoint_c(0.2, 0.3, 0.2, 0.1) == pytest.approx(31.6)
+
+
+def test_predictive_control_saves_with_coolant_loops() -> None:
+    config = hall("site.start=07-20")
+    figures = {}
+    for name in ("liquid=liquid-greedy", "liquid=mpc-24h", "mpc-24h:energy"):
+        with Simulator(config) as sim:
+            controller = make_controller(name, sim.fleet)
+            sim.reset(0)
+            score = Score(Objective.parse("energy"), sim)
+            simulate(sim, controller, 48, 0, on_step=score.add)
+            figures[name] = float(score.figure[0])
+            commands = {*LOOP_COMMANDS, *(AGENTS if name.startswith("mpc") else ())}
+            assert set(commands_of(controller)) == commands
+    greedy, loops, joint = figures.values()
+    assert loops < greedy * 1.0001
+    assert joint < greedy
 
 
 @pytest.mark.parametrize(

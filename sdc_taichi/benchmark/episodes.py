@@ -32,9 +32,10 @@ from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.split import DAYS_PER_WEEK, WEEKS
 from sdc_taichi.learning.training_settings import training_environment
 from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS as PARTS
-from sdc_taichi.optimum.problem import Agent
+from sdc_taichi.optimum.problem import ALL_AGENTS, Agent
 from sdc_taichi.optimum.rollout import Follower, Targets
 from sdc_taichi.optimum.solve import solve
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath
@@ -274,7 +275,7 @@ class FollowedOptimum:
     Args:
         steps: number of steps of an episode.
         objective: quantity to minimise.
-        agents: agents (load, cooling, battery) that the optimum controls; the others are idle.
+        agents: agents that the optimum controls; the others are idle.
         progress: progress callback of the optimiser.
         stop: called repeatedly by the optimiser; if it returns true, ``StoppedError`` is raised.
     """
@@ -315,7 +316,8 @@ class FollowedOptimum:
             progress=self._progress,
             stop=self._stop,
         )
-        rows: dict[str, list[F64]] = {name: [] for name in (f.name for f in fields(Targets))}
+        names = {f.name for f in fields(Targets)} - {"loops"}
+        rows: dict[str, list[F64]] = {name: [] for name in names}
 
         def record(result: StepResult) -> None:
             for name, values in rows.items():
@@ -323,7 +325,9 @@ class FollowedOptimum:
 
         with Simulator(view.fleet, drivers=view.drivers, precision=view.precision) as sim:
             simulate(sim, AchievedPath(optimum), self._steps, 0, on_step=record)
-        return Targets(**{name: np.stack(values) for name, values in rows.items()})
+        return Targets(
+            **{name: np.stack(values) for name, values in rows.items()}, loops=optimum.loops
+        )
 
 
 def objective_of_optimum(name: str) -> Objective | None:
@@ -391,7 +395,8 @@ def _make_actor(
             f"controller {name!r}: is not known where others act ({options.others}); valid with "
             f"others {IDLE}"
         )
-    planned = tuple(part for part in PARTS if part in decided)
+    moves_loops = set(LOOP_COMMANDS) <= set(decided)
+    planned = tuple(x for x in ALL_AGENTS if x in decided or (x == "liquid" and moves_loops))
     plan = FollowedOptimum(env.core.steps, objective, agents=planned, progress=progress, stop=stop)
     return _Commander(plan, env, decided)
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from sdc_taichi.optimum.problem import Agent
     from sdc_taichi.optimum.result import Optimum
     from sdc_taichi.run.achievable import Achievement
+    from sdc_taichi.sim.fleet import Fleet
     from sdc_taichi.sim.simulator import Simulator
 
 
@@ -66,9 +67,13 @@ def optimum_command(
     ] = "carbon",
     controller: Compared = None,
     agents: Annotated[
-        str,
-        typer.Option(metavar="NAME[,NAME]", help="What may be moved: load, cooling, battery."),
-    ] = "load,cooling,battery",
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="What may be moved: load, cooling, battery, and liquid (coolant loops). "
+            "[default: all]",
+        ),
+    ] = None,
     uncoordinated: Annotated[
         bool,
         typer.Option(
@@ -113,14 +118,18 @@ def optimum_command(
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
 
-    aim, movable = Objective.parse(objective), _agents(agents)
+    aim = Objective.parse(objective)
     fleet = build_fleet(sites.data_centers(config.read()[0], start=start))
     steps = whole_steps(days, fleet.steps_per_hour, "--days")
     scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
     require_events_start_before(24.0 * days, fleet.configs)
     fleet.require_distinct_names()
-    if uncoordinated and len(movable) < 2:
-        raise ConfigError(f"--uncoordinated --agents {agents}: valid is with two or more agents")
+    movable = _agents(agents, fleet)
+    if uncoordinated and len(set(movable) - {"liquid"}) < 2:
+        raise ConfigError(
+            f"--uncoordinated --agents {agents}: valid is with two or more of load, cooling and "
+            "battery"
+        )
     error = run.error()
     named = {name: make_controller(name, fleet) for name in controller or ()}
     if fleet.sites_per_fleet > 1:
@@ -163,8 +172,6 @@ def optimum_command(
             print(metrics_json(optimum_content(optimum, reached)))
         elif not quiet:
             _print_optimum(optimum_content(optimum, reached), fleet.steps_per_hour)
-            if fleet.cdus:
-                _print_loops(sim, aim, steps)
         is_written = False
         if out is not None and not interrupted():
             with progress_bar(steps, shown=not quiet) as advance:
@@ -221,7 +228,6 @@ def solve_beside(
         SdcError: there is no optimum for these data centers and inputs.
     """
     from sdc_taichi.optimum import solve
-    from sdc_taichi.optimum.problem import AGENTS
 
     with exit_if_stopped(), stage_bars(shown=not quiet) as progress:
         return solve(
@@ -230,7 +236,7 @@ def solve_beside(
             seed=seed,
             drivers=sim.drivers,
             objective=objective,
-            agents=AGENTS if agents is None else agents,
+            agents=agents,
             scored_from=scored_from,
             inlet_limit_c=inlet_limit_c,
             precision=sim.precision,
@@ -284,25 +290,30 @@ def _print_interruption(missing: list[str], out: Path | None) -> None:
     print(f"interrupted{text}; the figures above are whole", file=sys.stderr)
 
 
-def _agents(text: str) -> tuple[Agent, ...]:
-    """Parse the value of ``--agents``, and return its agents in the order of ``AGENTS``."""
-    from sdc_taichi.optimum.problem import AGENTS
+def _agents(text: str | None, fleet: Fleet) -> tuple[Agent, ...]:
+    """Parse the value of ``--agents``, and return its agents in their usual order."""
+    from sdc_taichi.optimum.task import checked_agents
 
+    known = checked_agents(None, fleet)
+    if text is None:
+        return known
     names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in AGENTS:
-            meant = suggestion(name, AGENTS, " (did you mean {!r}?)")
-            raise ConfigError(f"--agents {text!r}: {name!r}; valid are {', '.join(AGENTS)}{meant}")
+        if name not in known:
+            meant = suggestion(name, known, " (did you mean {!r}?)")
+            raise ConfigError(f"--agents {text!r}: {name!r}; valid are {', '.join(known)}{meant}")
         if names.count(name) > 1:
             raise ConfigError(f"--agents {text!r}: {name} is given twice; valid is each once")
-    return tuple(agent for agent in AGENTS if agent in names)
+    return tuple(agent for agent in known if agent in names)
 
 
 def _require_movable(name: str, controller: Controller, movable: tuple[Agent, ...]) -> None:
     """Raise ``ConfigError`` if a controller decides commands that the optimum leaves idle."""
     from sdc_taichi.control import commands_of
+    from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
 
-    more = [command for command in commands_of(controller) if command not in movable]
+    moved = (*movable, *(LOOP_COMMANDS if "liquid" in movable else ()))
+    more = [command for command in commands_of(controller) if command not in moved]
     if more:
         raise ConfigError(
             f"--controller {name}: moves {' and '.join(more)}, which --agents "
@@ -355,40 +366,6 @@ def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
     console.print(figures_table(console, titles, names, columns, total, "z.2f"))
     for line in first_lines(optimum_remarks(content), MOST_LINES, ", see --json"):
         console.print(line)
-
-
-def _print_loops(sim: Simulator, objective: Objective, steps: int) -> None:
-    """Print a line on the optimum of coolant loops of each data center, or why there is none.
-
-    Args:
-        sim: the simulator of the data centers.
-        objective: what to minimise.
-        steps: number of steps.
-    """
-    from sdc_taichi.optimum.loop_optimum import loop_optimum
-    from sdc_taichi.sim.fleet import build_fleet
-
-    for dc, name in enumerate(sim.fleet.names):
-        try:
-            one = sim.drivers.take([dc])
-            best = loop_optimum(
-                build_fleet(sim.fleet.configs[dc]),
-                one,
-                start=one.start,
-                steps=steps,
-                objective=objective,
-                precision=sim.precision,
-            )
-        except ConfigError as error:
-            print(error)
-            continue
-        bound, achieved = (
-            100.0 * (float(x[0] / best.idle[0]) - 1.0) for x in (best.bound, best.achieved)
-        )
-        print(
-            f"{name}: coolant loops alone, over all steps: bound {bound:.2f} %, achieved "
-            f"{achieved:.2f} % against idle"
-        )
 
 
 def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[float | None]:

@@ -8,7 +8,7 @@ from sdc_taichi.config.liquid_schema import SETPOINT_LIMITS_C
 from sdc_taichi.control.rules import WithoutMemory
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.optimum.loop_map import LoopCommands
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS, LoopCommands
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import Actions
 
@@ -71,7 +71,7 @@ class GreedyLoops(WithoutMemory):
     move towards them by up to 2 K in each step. All CDUs of a data center get the same commands.
     """
 
-    commands = ("cdu_setpoint_c", "cdu_flow", "facility_approach_k")
+    commands = LOOP_COMMANDS
     """Fields of ``Actions`` that it gives."""
 
     def __init__(self) -> None:

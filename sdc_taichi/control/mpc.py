@@ -1,10 +1,11 @@
 """Model-predictive control: plan the coming hours before each step, and apply the first command.
 
-A plan covers work, setpoint and battery up to a horizon. It uses only the information of a view:
-forecasts of weather and carbon intensity, prices, and the work of the next step. The forecast of
-later work is based on the work at the same time of past days. Energies come from a ``FacilityMap``,
-tables of the simulator at constant load and setpoint, so plans ignore transients, events, and racks
-that throttle or switch off. B is the number of data centers and H the number of steps of a plan.
+A plan covers work, setpoint, battery and coolant loops up to a horizon. It uses only the
+information of a view: forecasts of weather and carbon intensity, prices, and the work of the next
+step. The forecast of later work is based on the work at the same time of past days. Energies come
+from a ``FacilityMap``, tables of the simulator at constant load and setpoint, so plans ignore
+transients, events, and racks that throttle or switch off. B is the number of data centers and H the
+number of steps of a plan.
 """
 
 from __future__ import annotations
@@ -15,18 +16,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sdc_taichi.config.liquid_schema import SETPOINT_LIMITS_C
 from sdc_taichi.control.rules import setpoint_command
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
+from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.bills import BilledDemand, add_power, no_demand
+from sdc_taichi.sim.liquid import SETPOINT_STEP_K as LOOP_RAMP_K
 from sdc_taichi.types import F64, I64, Actions
 
 if TYPE_CHECKING:
-    from sdc_taichi.control.plans import QueuePlan, StorePlanner, Weather
+    from sdc_taichi.control.plans import EnergyCost, QueuePlan, StorePlanner, Weather
+    from sdc_taichi.optimum.loop_map import LoopCommands
 
+LOOP_STEP_K = 0.5
+"""Spacing of the candidate supply setpoints of CDUs, in K."""
 HORIZON_H = (1.0, 168.0)
 """Shortest and longest horizon, in h."""
 CARBON = Objective(carbon=1.0)
@@ -107,7 +115,8 @@ class ModelPredictive:
                     "carbon, energy, cost, and sums of them"
                 )
         self._hours, self._objective, self._agents = hours, objective, agents
-        self.commands: tuple[str, ...] = agents
+        loops = LOOP_COMMANDS if "liquid" in agents else ()
+        self.commands: tuple[str, ...] = (*(a for a in agents if a in AGENTS), *loops)
         self._planners: _Planners | None = None
         self.reset(0)
 
@@ -156,6 +165,8 @@ class ModelPredictive:
             commands["battery"] = planners.store.plan(
                 view.state.stored_kwh, work.facility_kwh, cost, peaks=peaks
             )
+        if planners.loops is not None:
+            commands |= _loop_commands(view, planners.loops, weather, work, cost)
         return Actions(**commands)
 
     def _month_peak_kw(self, view: View) -> F64:
@@ -174,16 +185,21 @@ class _Planners:
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.plans import QueuePlanner, StorePlanner
         from sdc_taichi.optimum.facility_map import facility_map
+        from sdc_taichi.optimum.loop_map import LoopCommands
         from sdc_taichi.optimum.problem import inlet_limits_c, require_traces
 
         require_traces(view.fleet)
         self._sizing, self._drivers = view.sizing, view.drivers
+        self.loops: LoopCommands | None = None
+        if "liquid" in agents:
+            self.loops = LoopCommands(view.fleet, view.drivers)
         self.facility = facility_map(
             view.fleet,
             view.drivers,
             inlet_limit_c=inlet_limits_c(view.fleet),
             setpoint_step_k=SETPOINT_STEP_K,
             precision=view.precision,
+            loops=self.loops,
         )
         allowed = self.facility.at_own_nodes(self.facility.allowed)
         self.is_limited = np.array([not nodes.all() for nodes in allowed])[self.facility.which]
@@ -232,7 +248,7 @@ def _cooling_command(view: View, planners: _Planners, weather: Weather, work: Qu
     """Return the command towards the setpoint of minimum energy in the next step, (B,)."""
     now = slice(0, 1)
     best_c = planners.facility.best_setpoint_c(
-        (work.executed_tasks / 100.0)[:, None],
+        work.executed_tasks[:, now] / TASKS_PER_STEP,
         weather.outdoor_c[:, now],
         weather.wet_bulb_c[:, now],
     )[:, 0]
@@ -241,3 +257,41 @@ def _cooling_command(view: View, planners: _Planners, weather: Weather, work: Qu
     gradual_c = np.maximum(target_c, view.setpoint_c - RAMP_K)
     target_c = np.where(planners.is_limited, target_c, gradual_c)
     return setpoint_command(target_c, view)
+
+
+def _loop_commands(
+    view: View, loops: LoopCommands, weather: Weather, work: QueuePlan, cost: EnergyCost
+) -> dict[str, F64]:
+    """Return the commands of the coolant loops in the next step, by field of ``Actions``.
+
+    Flow and facility water are the best steady ones. The supply setpoint is the first of a path
+    whose steps are up to 2 K high, and whose squared distance from the best steady setpoints,
+    weighted with the cost of energy, is least. The square stands for the additional power, which is
+    lowest at the best setpoint.
+    """
+    from sdc_taichi.optimum.paths import setpoint_path
+
+    utilisation = work.executed_tasks / TASKS_PER_STEP
+    (first_c, last_c), first_of = SETPOINT_LIMITS_C, view.fleet.cdu_offsets[:-1]
+    best = np.stack(
+        [
+            loops.of(dc).at(weather.outdoor_c[dc], weather.wet_bulb_c[dc], utilisation[dc])
+            for dc in range(view.size)
+        ],
+        axis=1,
+    )
+    setpoint_c = best[0, :, 0].copy()
+    for dc in np.flatnonzero(np.diff(view.fleet.cdu_offsets)).tolist():
+        start_c, path_c = float(view.state.cdu_setpoint_c[first_of[dc]]), best[0, dc]
+        if np.abs(np.diff(path_c, prepend=start_c)).max() <= LOOP_RAMP_K:
+            continue
+        # One of the candidates is the best setpoint of the next step.
+        below = np.arange(path_c[0], first_c - LOOP_STEP_K, -LOOP_STEP_K)[::-1]
+        above = np.arange(path_c[0], last_c + LOOP_STEP_K, LOOP_STEP_K)[1:]
+        candidates_c = np.unique(np.clip(np.concatenate([below, above]), first_c, last_c))
+        excess = cost.weight[dc, :, None] * (candidates_c - path_c[:, None]) ** 2
+        path_c = setpoint_path(excess, candidates_c, ramp_k=LOOP_RAMP_K, start_c=start_c)
+        setpoint_c[dc] = path_c[0]
+    of_cdus = view.fleet.cdu_dc
+    values = setpoint_c[of_cdus], best[1, of_cdus, 0], best[2, :, 0]
+    return dict(zip(LOOP_COMMANDS, values, strict=True))

@@ -157,7 +157,7 @@ class QueuePlan(NamedTuple):
     load: F64
     """Load command, (B,)."""
     executed_tasks: F64
-    """Work executed in the next step, in tasks, (B,)."""
+    """Work executed in each step of the plan, in tasks, (B, H)."""
     facility_kwh: F64
     """Energy of the facility in each step of the plan, in kWh, (B, H)."""
 
@@ -225,6 +225,7 @@ class QueuePlanner:
             "peak_kwh": cost.peak_kwh,
             "peak_cost": cost.peak_cost,
         }
+        executed_tasks = np.zeros((size, horizon))
         chosen, facility_kwh = self._kernel.run(
             size,
             horizon,
@@ -236,10 +237,11 @@ class QueuePlanner:
             first_executed=now.started_tasks,
             first_waiting=waiting[:, None] + now.deferred_tasks - now.dequeued_tasks,
             first_late=now.dropped_tasks,
+            executed=executed_tasks,
         )
         return QueuePlan(
             load=self._first[chosen],
-            executed_tasks=now.started_tasks[np.arange(size), chosen],
+            executed_tasks=executed_tasks,
             facility_kwh=facility_kwh,
         )
 

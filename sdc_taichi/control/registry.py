@@ -41,7 +41,7 @@ from sdc_taichi.errors import (
     suggestion_or_valid,
 )
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.optimum.problem import AGENTS, Agent
+from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import check_code, import_path, imported, register_function
 
@@ -240,8 +240,11 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
     """Make a controller by name, for the ``parts`` of a spec; None stands for a plain name."""
     kind, colon, text = name.partition(":")
     if is_mpc(name):
-        agents = tuple(a for a in CONTROLLABLE if parts is None or a in parts)
-        entry = _NamedController(lambda: model_predictive(name, agents), CONTROLLABLE)
+        if "liquid" in (parts or ()):
+            require_liquid(name, fleet)
+        known = ALL_AGENTS if fleet.cdus else AGENTS
+        agents = tuple(a for a in known if parts is None or a in parts)
+        entry = _NamedController(lambda: model_predictive(name, agents), ALL_AGENTS)
     elif kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
     elif is_hall_rule(name):
@@ -256,7 +259,7 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
         of_part = {
             "cooling": [*HALL_RULES, _CONSTANT, _MPC, _POLICY],
             "geo": [],
-            "liquid": [_POLICY],
+            "liquid": [_MPC, _POLICY],
         }
         able += of_part.get(agent, [_MPC, _POLICY])
         raise ConfigError(

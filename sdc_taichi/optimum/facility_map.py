@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.hall.protection import Mask
+from sdc_taichi.optimum.loop_map import LoopCommands
 from sdc_taichi.optimum.tables import (
     FacilityTable,
     Nodes,
@@ -177,6 +178,7 @@ def facility_map(
     utilisations: int = 21,
     setpoint_step_k: float = 1.0,
     precision: Precision = "f32",
+    loops: LoopCommands | None = None,
 ) -> FacilityMap:
     """Compute the map of each data center of a fleet for the weather of its year.
 
@@ -190,6 +192,7 @@ def facility_map(
         utilisations: Number of utilisations, equally spaced from 0 to 1.
         setpoint_step_k: Maximum spacing of setpoints, in K.
         precision: Floating-point precision of the server kernels.
+        loops: Best commands of the coolant loops, which the entries have; None holds the loops.
 
     Raises:
         PhysicalLimitError: A hall has no steady air state at some utilisation and setpoint.
@@ -215,7 +218,7 @@ def facility_map(
     for part in batches(fleet, nodes):
         rows = slice(len(tables), len(tables) + len(part))
         at = weather.outdoor_c[rows], weather.wet_bulb_c[rows]
-        tables += tabulate(fleet, drivers, part, *at, precision)
+        tables += tabulate(fleet, drivers, part, *at, precision, loops)
     shape = len(dcs), *weather.shape, utilisations, setpoints
     return FacilityMap(
         which=which,

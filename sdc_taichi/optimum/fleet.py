@@ -332,6 +332,8 @@ def solve_fleet(
     least = shared.delay_steps + 1
     steps = whole_number("steps", steps, least, MOST_H * fleet.steps_per_hour)
     reasons = [reason for reason in no_table_reasons(fleet) if reason]
+    if fleet.cdus:
+        reasons.append("actions move coolant loops (section liquid), which plans hold")
     if reasons:
         raise ConfigError(f"optimum of a fleet: no bound, since {reasons[0]}")
     sim.reset()

@@ -33,6 +33,15 @@ UTILISATIONS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 """Utilisations of the nodes."""
 AIR_SIDE_W_PER_W = 0.25
 """Power of the air-side cooling per heat that it removes, of which the commands depend little."""
+SAMPLES = 48
+"""Number of steps in which the commands of a table are compared with others."""
+_TRIED, _ROUNDS = 512, 3
+"""Number of other commands in each round of the comparison, and number of rounds."""
+_SPANS = np.array([6.0, 0.3, 5.0])
+"""Largest distance of the other commands in the first round: of the setpoint in K, of the flow, and
+of the approach in K. It halves from round to round."""
+LOOP_COMMANDS = "cdu_setpoint_c", "cdu_flow", "facility_approach_k"
+"""Fields of ``Actions`` that the tables give."""
 _LIMITS = np.array([SETPOINT_LIMITS_C, FLOW_LIMITS, APPROACH_LIMITS_K])
 _COUNTS, _FINER_COUNTS = (14, 5, 4), (5, 5, 3)
 """Numbers of setpoints, flows and approaches of the first grid, and of the finer ones."""
@@ -76,8 +85,7 @@ class LoopMap:
             ]
             weight = np.prod(shares, axis=0)
             out += weight * self.commands[(slice(None), *index)]
-        # Sums of weights may differ from 1 in the last digit.
-        return np.asarray(np.clip(out.T, *_LIMITS.T).T)
+        return in_range(out)
 
 
 def loop_map(
@@ -86,6 +94,7 @@ def loop_map(
     outdoor_c: F64,
     wet_bulb_c: F64,
     dew_point_c: Callable[[F64, F64], F64],
+    follows_humidity: bool = False,
 ) -> LoopMap:
     """Compute the map of one data center for a range of weather.
 
@@ -95,11 +104,13 @@ def loop_map(
         wet_bulb_c: wet bulbs of the same steps, in C, (T,).
         dew_point_c: function from dry bulb and wet bulb to the dew point of the room, in C, (1,)
             each.
+        follows_humidity: True if this dew point depends on the weather.
     """
     dry = _nodes(outdoor_c)
-    # Dry coolers do not depend on the wet bulb.
-    plants = loops.plants
-    depression = _nodes(outdoor_c - wet_bulb_c) if np.any(plants.rejection) else np.zeros(1)
+    # Dry coolers do not depend on the wet bulb, but the dew point of the room may.
+    depression = np.zeros(1)
+    if np.any(loops.plants.rejection) or follows_humidity:
+        depression = _nodes(outdoor_c - wet_bulb_c)
     racks, levels = int(loops.rack_offsets[-1]), len(UTILISATIONS)
     trials = {
         counts: CommandedLoops(loops, levels * int(np.prod(counts)))
@@ -142,7 +153,8 @@ class LoopCommands:
     """Best steady commands of the loops of a fleet, in any weather of its year.
 
     Args:
-        fleet: B data centers with liquid-cooled racks.
+        fleet: B data centers, some with liquid-cooled racks; for the others the commands are those
+            in the middle of their ranges, without effect.
         drivers: their inputs.
 
     Attributes:
@@ -154,7 +166,13 @@ class LoopCommands:
         assert fleet.liquid is not None
         maps: dict[Hashable, LoopMap] = {}
         self._maps: list[LoopMap] = []
+        middle = np.repeat(_LIMITS.mean(axis=1), len(UTILISATIONS)).reshape(3, 1, 1, -1)
+        without = LoopMap(np.zeros(1), np.zeros(1), middle)
+        self._dew_points_c = [RoomDewPoint(build_fleet(config)).at for config in fleet.configs]
         for dc, config in enumerate(fleet.configs):
+            if config.liquid is None:
+                self._maps.append(without)
+                continue
             series = drivers.outdoor_c, drivers.wet_bulb_c
             places = tuple((int(s.offsets[dc]), int(s.lengths[dc])) for s in series)
             key = config.hall, config.liquid, config.site.location, places
@@ -168,9 +186,14 @@ class LoopCommands:
                     part_of(fleet.liquid, dc),
                     outdoor_c=outdoor_c,
                     wet_bulb_c=wet_bulb_c,
-                    dew_point_c=RoomDewPoint(build_fleet(config)).at,
+                    dew_point_c=self._dew_points_c[dc],
+                    follows_humidity=config.liquid.dew_point_c is None,
                 )
             self._maps.append(maps[key])
+
+    def of(self, dc: int) -> LoopMap:
+        """Return the map of one data center."""
+        return self._maps[dc]
 
     def at(self, outdoor_c: F64, wet_bulb_c: F64, utilisation: F64) -> F64:
         """Return supply setpoint in C, flow as a share of design, and approach in K, (3, B).
@@ -182,6 +205,54 @@ class LoopCommands:
         """
         inputs = zip(self._maps, outdoor_c, wet_bulb_c, utilisation, strict=True)
         return np.stack([each.at(*(np.asarray(x) for x in values)) for each, *values in inputs], 1)
+
+    def excess_w(self, dc: int, outdoor_c: F64, wet_bulb_c: F64, utilisation: F64) -> F64:
+        """Return how much more power the commands need than the best of many others, in W, (n,).
+
+        The others are random, around the commands and then around the best ones so far. The power
+        of the air side is represented as in the maps.
+
+        Args:
+            dc: index of the data center.
+            outdoor_c: dry bulb, in C, (n,).
+            wet_bulb_c: wet bulb, in C, (n,).
+            utilisation: work as a share of capacity, 0..1, (n,).
+
+        Returns:
+            The excess; inf where the commands throttle GPUs and others do not.
+        """
+        assert self.fleet.liquid is not None
+        loops = part_of(self.fleet.liquid, dc)
+        racks, trials = int(loops.rack_offsets[-1]), CommandedLoops(loops, _TRIED)
+        offsets = np.random.default_rng(0).uniform(-1.0, 1.0, (_ROUNDS, 3, _TRIED))
+        offsets[:, :, 0] = 0.0
+        dew_point_c = self._dew_points_c[dc](outdoor_c, wet_bulb_c)
+        excess_w = np.zeros(len(outdoor_c))
+        for k, centre in enumerate(self.of(dc).at(outdoor_c, wet_bulb_c, utilisation).T):
+            conditions = LoopConditions(
+                np.full(racks, utilisation[k]),
+                np.ones(racks),
+                float(outdoor_c[k]),
+                float(wet_bulb_c[k]),
+                float(np.broadcast_to(dew_point_c, len(excess_w))[k]),
+            )
+            costs_w = []
+            for i, each in enumerate(offsets):
+                tried = in_range(centre[:, None] + 0.5**i * _SPANS[:, None] * each)
+                states = trials.at(tried, conditions)
+                cost_w = states.power_w + AIR_SIDE_W_PER_W * states.air_w
+                cost_w[states.lost > 0.0] = np.inf
+                costs_w += [cost_w[0], cost_w.min()]
+                centre = tried[:, cost_w.argmin()]
+            if np.isfinite(costs_w[-1]):
+                excess_w[k] = costs_w[0] - min(costs_w)
+        trials.close()
+        return excess_w
+
+
+def in_range(commands: F64) -> F64:
+    """Return interpolated commands, (3, ...), in their ranges, which rounding errors may exceed."""
+    return np.asarray(np.clip(commands.T, *_LIMITS.T).T)
 
 
 def _nodes(values: F64) -> F64:

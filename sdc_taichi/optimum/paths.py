@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sdc_taichi.optimum.linear_programme import plan
+from sdc_taichi.optimum.loop_map import in_range
 from sdc_taichi.optimum.problem import Agent, Problem, Storage
 from sdc_taichi.optimum.rollout import Targets, battery_command, bus_energy_kwh
 from sdc_taichi.optimum.tables import (
@@ -60,7 +61,7 @@ def path_of(
 
     The path is planned in three stages. A linear programme gives the work of each step, dynamic
     programming gives the setpoints for this work, and the battery is planned for the energy that
-    the facility then needs.
+    the facility then needs. Coolant loops have their best steady commands for this work.
 
     Args:
         problem: The planning problem.
@@ -70,11 +71,11 @@ def path_of(
     Raises:
         ConfigError: No plan satisfies the limits.
     """
-    plans: dict[Agent, F64] = {}
+    problem, plans = problem.moving(agents), dict[Agent, F64]()
     if "load" in agents:
-        plans["load"] = plan(replace(problem, agents=agents), check=check).executed_tasks
+        plans["load"] = plan(problem, check=check).executed_tasks
     for agent in agents:
-        if agent != "load":
+        if agent in ("cooling", "battery"):
             plans[agent] = best_response(problem, agent, plans)
     return targets_of(problem, plans)
 
@@ -88,7 +89,8 @@ def best_response(
     """Return the best plan of one agent while other agents follow known plans, (T,).
 
     The plan of ``load`` is the executed work in tasks, that of ``cooling`` the setpoint in C, and
-    that of ``battery`` the energy stored after each step in kWh.
+    that of ``battery`` the energy stored after each step in kWh. Coolant loops have no plan: if the
+    problem moves them, they follow the work of each step.
 
     Args:
         problem: The planning problem.
@@ -116,11 +118,21 @@ def targets_of(problem: Problem, plans: Mapping[Agent, F64]) -> Targets:
         plans: Plans as from ``best_response``; agents without a plan are idle.
     """
     known = _following(problem, plans)
-    facility = facility_kwh(known.table, _utilisation(known), known.idle_setpoint_c)
+    utilisation = _utilisation(known)
+    facility = facility_kwh(known.table, utilisation, known.idle_setpoint_c)
     nothing = np.full(problem.steps, np.nan)
     queue = _queue_tasks(problem, plans["load"]) if "load" in plans else nothing
     stored = plans.get("battery", nothing)
-    return Targets(*(x[:, None] for x in (queue, known.idle_setpoint_c, stored, facility)))
+    loops = known.table.loops
+    if loops is not None:
+        loops = in_range(at_utilisation(loops, known.table.utilisation, utilisation).T).T[:, None]
+    return Targets(
+        queue_tasks=queue[:, None],
+        setpoint_c=known.idle_setpoint_c[:, None],
+        stored_kwh=stored[:, None],
+        facility_kwh=facility[:, None],
+        loops=loops,
+    )
 
 
 def _following(problem: Problem, plans: Mapping[Agent, F64]) -> Problem:

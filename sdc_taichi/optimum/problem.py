@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -31,9 +31,11 @@ from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import Workload, due_steps, queue_limit_tasks
 from sdc_taichi.types import F64, I64
 
-Agent = Literal["load", "cooling", "battery"]
+Agent = Literal["load", "cooling", "battery", "liquid"]
 AGENTS: tuple[Agent, ...] = ("load", "cooling", "battery")
-"""Agents that a plan may control, named by their fields of ``Actions``."""
+"""Agents of every data center that a plan may control, named by their fields of ``Actions``."""
+ALL_AGENTS: tuple[Agent, ...] = (*AGENTS, "liquid")
+"""All agents that a plan may control; ``liquid`` commands the coolant loops where there are any."""
 RAMP_K = 2.0
 """Maximum change of the setpoint in a step, in K, equal to the default of environments."""
 
@@ -179,6 +181,10 @@ class Problem:
     battery_kwh: F64 | None = None
     """Energy that a battery outside ``agents`` draws from the bus in each step, standby included,
     in kWh, (T,); negative where the battery delivers. None means an idle battery."""
+    held: FacilityTable | None = None
+    """Table with held coolant loops; None where ``table`` is that."""
+    loops_error: float = 0.0
+    """Energy by which the commands of coolant loops in ``table`` exceed the best ones, relative."""
     end_margin_kwh: float = 0.0
     """Energy that the plan of a battery stores at the end beyond what the end needs, in kWh."""
 
@@ -186,6 +192,12 @@ class Problem:
     def steps(self) -> int:
         """Number of steps, T."""
         return len(self.kwh_weight)
+
+    def moving(self, agents: tuple[Agent, ...]) -> Problem:
+        """Return the problem of a plan that controls only some of the agents."""
+        if self.held is None or "liquid" in agents:
+            return replace(self, agents=agents)
+        return replace(self, agents=agents, table=self.held, held=None)
 
 
 def require_traces(fleet: Fleet) -> None:
@@ -213,6 +225,7 @@ def problems_of(
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
     ramp_k: float = RAMP_K,
+    held: Sequence[FacilityTable] | None = None,
 ) -> list[Problem]:
     """Create the planning problem of each data center of a fleet.
 
@@ -228,6 +241,7 @@ def problems_of(
         inlet_limit_c: Highest inlet temperature that a plan may cause if another setpoint avoids
             it, in C. None means the limit of ``protection.ashrae_class``, or no limit without it.
         ramp_k: Maximum change of the setpoint in a step, in K.
+        held: Tables with held coolant loops; None where ``tables`` are that.
     """
     steps = len(tables[0].facility_kwh)
     index = start[:, None] + np.arange(steps)
@@ -257,6 +271,7 @@ def problems_of(
             setpoint_c=float(initial_c[i]),
             ramp_k=ramp_k,
             scored_from=scored_from,
+            held=None if held is None else held[i],
         )
         for i, name in enumerate(fleet.names)
     ]
@@ -497,6 +512,27 @@ def _reasons(config: DataCenterConfig) -> list[str]:
         reasons.append(_PLACEMENT[config.workload.placement])
     if config.hvac.crac.flow_model == "controlled":
         reasons.append("actions move the fans (flow model controlled)")
-    if config.liquid is not None:
-        reasons.append("actions move coolant loops (section liquid), which plans hold")
     return reasons
+
+
+def loops_reason(problem: Problem, config: DataCenterConfig) -> str | None:
+    """Return why the commands of coolant loops in a table may not be the best ones.
+
+    Args:
+        problem: Planning problem of the data center.
+        config: Config of the data center.
+
+    Returns:
+        The reason in words, or None if they are the best ones or loops are held.
+    """
+    if problem.table.loops is None or config.liquid is None:
+        return None
+    if problem.litre_weight > 0:
+        return "the tables of coolant loops hold the commands of least energy, not of least water"
+    if config.workload.placement != "uniform":
+        return "the tables of coolant loops are of equal loads on all racks, not of placement " + (
+            config.workload.placement
+        )
+    if np.isinf(problem.loops_error):
+        return "commands of the tables of coolant loops throttle GPUs, and others do not"
+    return None

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from sdc_taichi.config.liquid_schema import APPROACH_LIMITS_K
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
 from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.problem import Problem, arrived_tasks
 from sdc_taichi.optimum.tables import (
@@ -55,6 +57,9 @@ class Targets:
     """Energy stored after each step, in kWh, (T, B); nan means an idle battery."""
     facility_kwh: F64
     """Expected energy of the facility in each step, in kWh, (T, B)."""
+    loops: F64 | None = None
+    """Commands of the coolant loops in each step, (T, B, 3): supply setpoint in C, flow as a share
+    of design, and approach in K. nan, or None for all, means held loops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +92,8 @@ class RollOut:
     """Cooling command, in steps of the setpoint, (T, B)."""
     battery_command: F64
     """Battery command, -1..1, (T, B)."""
+    loops_lag_k: F64
+    """Largest difference between the supply setpoint of a CDU and its target, in K, (T, B)."""
 
     def of(self, where: Sequence[int]) -> RollOut:
         """Return the results of some of the data centers.
@@ -140,8 +147,9 @@ def roll_out(
         for t in range(steps):
             result: StepResult = sim.step(follower.actions(sim.state))
             score.add(result)
-            for name, values in done.items():
-                values[t] = getattr(result, name)
+            for name in done.keys() - {"loops_lag_k"}:
+                done[name][t] = getattr(result, name)
+            done["loops_lag_k"][t] = follower.loops_lag_k(sim.state)
             on_step()
     return RollOut(**done), score
 
@@ -158,7 +166,7 @@ class Follower:
 
     def __init__(self, fleet: Fleet, drivers: Drivers, sizing: Sizing, targets: Targets) -> None:
         v, models = fleet.values, fleet.models
-        self._drivers, self._targets = drivers, targets
+        self._fleet, self._drivers, self._targets = fleet, drivers, targets
         self._step_h = 1.0 / fleet.steps_per_hour
         self._work = {
             "flexible_share": v("workload.flexible_share"),
@@ -185,7 +193,21 @@ class Follower:
             load=self._load(state),
             cooling=self._cooling(state),
             battery=self._battery_command(state),
+            **loop_commands(self._targets.loops, state, self._fleet),
         )
+
+    def loops_lag_k(self, state: State) -> F64:
+        """Return the largest difference between setpoint and target of a CDU, in K, (B,).
+
+        Args:
+            state: State after a step.
+        """
+        lag_k = np.zeros(self._fleet.size)
+        if self._targets.loops is not None:
+            target_c = self._targets.loops[state.step - 1, self._fleet.cdu_dc, 0]
+            apart_k = np.abs(state.cdu_setpoint_c - target_c)
+            np.maximum.at(lag_k, self._fleet.cdu_dc, np.nan_to_num(apart_k))
+        return lag_k
 
     def _load(self, state: State) -> F64:
         target = self._targets.queue_tasks[state.step]
@@ -221,6 +243,27 @@ class Follower:
             capacity_kwh=self._capacity_kwh,
             parameters=self._battery,
         )
+
+
+def loop_commands(loops: F64 | None, state: State, fleet: Fleet) -> dict[str, F64]:
+    """Return the commands of the coolant loops in the coming step, by field of ``Actions``.
+
+    Args:
+        loops: Commands of each step, (T, B, 3), as in ``Targets``; nan holds the loops.
+        state: State before the step.
+        fleet: B data centers.
+    """
+    if loops is None:
+        return {}
+    sections = [config.liquid for config in fleet.configs]
+    approach_k = np.array(
+        [APPROACH_LIMITS_K[0] if s is None else s.cdus.approach_k for s in sections]
+    )
+    setpoint_c, flow, wanted_k = loops[state.step].T
+    held = state.cdu_setpoint_c, state.cdu_flow, approach_k
+    wanted = setpoint_c[fleet.cdu_dc], flow[fleet.cdu_dc], wanted_k
+    values = (np.where(np.isnan(x), hold, x) for x, hold in zip(wanted, held, strict=True))
+    return dict(zip(LOOP_COMMANDS, values, strict=True))
 
 
 def load_command(
@@ -383,7 +426,8 @@ class Certificate:
     """Value of the objective in the scored steps."""
     table_error: float
     """Relative error of the table: the sum of absolute differences between simulated and tabulated
-    energy of each step, divided by the simulated energy of all steps."""
+    energy of each step, divided by the simulated energy of these steps. Steps in which supply
+    setpoints of coolant loops are still on the way to their targets do not count."""
     start_kwh: float
     """Energy stored at the first scored step, in kWh."""
     end_kwh: float
@@ -489,7 +533,7 @@ def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certif
     """Measure the constraints, the figure and the table error of one simulated plan.
 
     Args:
-        problem: Planning problem of the data center.
+        problem: Planning problem of the data center, with the agents that the plan moves.
         done: Simulated results of this plan alone.
         score: Score of all plans that were simulated together.
         i: Index of this plan in the score.
@@ -498,11 +542,13 @@ def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certif
     measured = done.facility_kwh[scored, 0]
     expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
     limits_c = _reachable_limits_c(problem, done)
+    settled = done.loops_lag_k[scored, 0] <= LEAST_K
+    apart = np.abs(expected[scored] - measured)[settled].sum()
     has_limit = np.isfinite(problem.inlet_limit_c)
     over_k = done.inlet_max_c[:, 0] - limits_c if has_limit else np.zeros(problem.steps)
     return Certificate(
         figure=float(score.figure[i]),
-        table_error=float(np.abs(expected[scored] - measured).sum() / measured.sum()),
+        table_error=float(apart / measured[settled].sum()) if settled.any() else 0.0,
         start_kwh=float(score.start_kwh[i]),
         end_kwh=float(score.end_kwh[i]),
         start_tasks=float(score.start_tasks[i]),

@@ -30,12 +30,12 @@ from sdc_taichi.optimum.paths import (
     with_battery_for,
 )
 from sdc_taichi.optimum.problem import (
-    AGENTS,
     Agent,
     Ends,
     Problem,
     StoppedError,
     forced_discharge_reason,
+    loops_reason,
     no_table_reasons,
     require_traces,
     uncooled_reason,
@@ -96,7 +96,7 @@ def solve(
     seed: int = 0,
     drivers: Drivers | None = None,
     objective: Objective | str = "carbon",
-    agents: Sequence[Agent] = AGENTS,
+    agents: Sequence[Agent] | None = None,
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
     precision: Precision = "f32",
@@ -118,7 +118,8 @@ def solve(
         seed: Seed of the sampled events.
         drivers: Inputs of the data centers; None reads the inputs that the configs name.
         objective: Objective to minimise, as object or text.
-        agents: Agents that plans may control.
+        agents: Agents that plans may control; None means all: load, cooling and battery, and
+            liquid where there are coolant loops.
         scored_from: Number of the first scored step. If it is not 0, plans must end in the state of
             this step.
         inlet_limit_c: Highest inlet temperature that plans may cause if another setpoint avoids it,
@@ -151,6 +152,7 @@ def solve(
     inputs = load_drivers(fleet.configs) if drivers is None else drivers
     if inputs.size != fleet.size:
         raise ConfigError(f"drivers of {inputs.size} data centers for a fleet of {fleet.size}")
+    movable = checked_agents(agents, fleet)
     task = Task(
         fleet=fleet,
         drivers=with_prices(inputs, fleet.configs),
@@ -158,11 +160,11 @@ def solve(
         seed=seeds_of_sampled_events(seeds_of_fleet(seed, fleet.names), fleet),
         steps=steps,
         objective=Objective.parse(objective) if isinstance(objective, str) else objective,
-        agents=checked_agents(agents),
+        agents=movable,
         scored_from=whole_number("scored_from", scored_from, 0, steps - 1),
         inlet_limit_c=inlet_limit_c,
         precision=precision,
-        uncoordinated=uncoordinated and len(checked_agents(agents)) > 1,
+        uncoordinated=uncoordinated and len(_players(movable)) > 1,
     )
     if task.objective.heat:
         raise ConfigError(
@@ -212,8 +214,22 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
         load=paths("load"),
         cooling=paths("cooling"),
         battery=paths("battery"),
+        loops=_loops(task, entries),
         bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries], cache),
     )
+
+
+def _loops(task: Task, entries: Sequence[Entry]) -> F64 | None:
+    """Return the commands of the coolant loops in the best plans, (T, B, 3); None if all hold."""
+    if not any(len(entry.loops) for entry in entries):
+        return None
+    held = np.full((task.steps, 3), np.nan)
+    return np.stack([entry.loops if len(entry.loops) else held for entry in entries], axis=1)
+
+
+def _players(agents: Sequence[Agent]) -> tuple[Agent, ...]:
+    """Return the agents that make a plan of their own; coolant loops follow the work."""
+    return tuple(agent for agent in agents if agent != "liquid")
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,12 +286,13 @@ class _Case:
 
         best = best_of(valid)
         error = max(of_path.table_error for of_path in certificates.values())
-        done = self.runs[best].done
+        done, loops = self.runs[best].done, self.runs[best].path.loops
+        margin = error + _SOLVER_ERROR + self.problem.loops_error
         return Entry(
             idle=idle.figure,
             idle_dropped_tasks=idle.dropped_tasks,
-            # Lower the bound by the measured error of the tables and the error of the solvers.
-            bound=self.bound - (error + _SOLVER_ERROR) * abs(self.bound),
+            # Lower the bound by the errors of the tables and of the solvers.
+            bound=self.bound - margin * abs(self.bound),
             achieved=certificates[best].figure,
             alone={
                 agent: certificates[best_of({agent, IDLE}.intersection(valid) or {IDLE})].figure
@@ -294,6 +311,7 @@ class _Case:
             load=done.load_command[:, 0],
             cooling=done.cooling_command[:, 0],
             battery=done.battery_command[:, 0],
+            loops=np.empty((0, 3)) if loops is None else np.ascontiguousarray(loops[:, 0]),
             uncoordinated={
                 way: self._valued_figure(certificate) for way, certificate in uncoordinated.items()
             },
@@ -322,6 +340,10 @@ class _Case:
             for end in ((of_path.end_kwh, of_path.end_tasks), start)
         )
         return of_path.figure + cyclic - best
+
+    def problem_of(self, path: Targets) -> Problem:
+        """Return the problem with the tables of a path, which moves the coolant loops or not."""
+        return self.problem if path.loops is not None else self.problem.moving(())
 
     def missing_kwh(self, name: str) -> float:
         """Return the stored energy that a simulated plan lacks at its end, in kWh; 0 without it."""
@@ -359,6 +381,19 @@ def _of_case(plans: Mapping[Agent, _Plans], i: int) -> dict[Agent, F64]:
     """Return the plans of data center ``i``, without those of agents that have none."""
     of_case = {agent: of_all[i] for agent, of_all in plans.items()}
     return {agent: plan for agent, plan in of_case.items() if plan is not None}
+
+
+def _beside(paths: Sequence[Targets]) -> Targets:
+    """Return the paths of n data centers, each with B = 1, as those of one batch with B = n."""
+    joined = {
+        f.name: np.concatenate([getattr(path, f.name) for path in paths], axis=1)
+        for f in fields(Targets)
+        if f.name != "loops"
+    }
+    held = np.full((*joined["setpoint_c"][:, :1].shape, 3), np.nan)
+    loops = [held if path.loops is None else path.loops for path in paths]
+    moved = any(path.loops is not None for path in paths)
+    return Targets(**joined, loops=np.concatenate(loops, axis=1) if moved else None)
 
 
 def _unreachable_limit(best: Certificate) -> tuple[str, ...]:
@@ -471,10 +506,13 @@ class _Work:
             _Case(
                 problem,
                 of_config
+                or loops_reason(problem, config)
                 or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
                 or forced_discharge_reason(problem),
             )
-            for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
+            for of_config, config, problem in zip(
+                no_table_reasons(task.fleet), task.fleet.configs, problems, strict=True
+            )
         ]
         self._run(task, cases, self._bounds_and_paths(cases))
         self._plan_batteries_again(task, cases)
@@ -537,7 +575,8 @@ class _Work:
 
     def _run_uncoordinated(self, task: Task, cases: Sequence[_Case]) -> None:
         """Simulate the plans that the agents of B data centers make without coordination."""
-        count, all_calls = 0, response_count(len(task.agents))
+        players = _players(task.agents)
+        count, all_calls = 0, response_count(len(players))
 
         def responses(agent: Agent, others: Mapping[Agent, _Plans]) -> _Plans:
             nonlocal count
@@ -551,7 +590,7 @@ class _Work:
                 (count - 1, all_calls),
             )
 
-        ways = uncoordinated(task.agents, responses)
+        ways = uncoordinated(players, responses)
         for case in cases:
             case.uncoordinated = tuple(ways)
         self._run(
@@ -633,12 +672,7 @@ class _Work:
         done, score = roll_out(
             build_fleet(task.fleet.configs * len(names)),
             task.drivers.take(list(range(size)) * len(names)),
-            Targets(
-                *(
-                    np.concatenate([getattr(path, f.name) for path in in_order], axis=1)
-                    for f in fields(Targets)
-                )
-            ),
+            _beside(in_order),
             start=np.tile(task.start, len(names)),
             objective=task.objective,
             scored_from=task.scored_from,
@@ -649,5 +683,5 @@ class _Work:
         for at, path in enumerate(in_order):
             case, of_path = cases[at % size], done.of([at])
             case.runs[names[at // size]] = _Run(
-                path, of_path, certificate(case.problem, of_path, score, at)
+                path, of_path, certificate(case.problem_of(path), of_path, score, at)
             )

@@ -11,6 +11,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
 from sdc_taichi.hall.protection import Mask
+from sdc_taichi.optimum.loop_map import LoopCommands
 from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
@@ -40,6 +41,10 @@ class FacilityTable:
     unmet_w: F64
     """Heat that the cooling does not remove from the room, in W, (T, I, J); inf if racks would
     throttle or results are not physical."""
+    loops: F64 | None = None
+    """Commands of the coolant loops at each utilisation, (T, I, 3): supply setpoint in C, flow as a
+    share of design, and approach in K. None means that the loops are held, or that there are
+    none."""
 
 
 MOST_COPIES = 4096
@@ -104,6 +109,7 @@ def facility_tables(
     utilisations: int | None = None,
     setpoint_step_k: float | None = None,
     precision: Precision = "f32",
+    loops: LoopCommands | None = None,
     on_step: OnStep | None = None,
 ) -> list[FacilityTable]:
     """Compute the tables of B data centers for the T steps of a run.
@@ -121,6 +127,7 @@ def facility_tables(
             entry of ``UTILISATIONS`` with an error of at most ``MOST_ERROR``.
         setpoint_step_k: Maximum spacing of setpoints, in K; see ``setpoints_c``.
         precision: Floating-point precision of the server kernels.
+        loops: Best commands of the coolant loops, which the entries have; None holds the loops.
         on_step: Called after every step of a batch of data centers.
 
     Returns:
@@ -136,7 +143,7 @@ def facility_tables(
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
     if utilisations is None:
-        counts = _fine_enough(fleet, drivers, distinct, start, steps, precision)
+        counts = _fine_enough(fleet, drivers, distinct, start, steps, precision, loops)
     else:
         counts = [utilisations] * len(distinct)
     nodes = [
@@ -154,7 +161,7 @@ def facility_tables(
             if on_step is not None:
                 on_step(before + size * step, len(distinct) * steps)
 
-        of_batch = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, tell)
+        of_batch = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, loops, tell)
         tables |= {node.dc: table for node, table in zip(batch, of_batch, strict=True)}
     return [tables[dc] for dc in table_of]
 
@@ -166,6 +173,7 @@ def tabulate(
     outdoor_c: F64,
     wet_bulb_c: F64,
     precision: Precision,
+    loops: LoopCommands | None = None,
     on_step: Callable[[int], None] | None = None,
 ) -> list[FacilityTable]:
     """Compute the tables of n data centers for T steps of given weather, in one batch.
@@ -177,11 +185,25 @@ def tabulate(
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
         precision: Floating-point precision of the server kernels.
+        loops: Best commands of the coolant loops of the B data centers; None holds the loops.
         on_step: Called after every step with the number of finished steps.
 
     Returns:
         A table for each of the n data centers.
     """
+    commands = [
+        _loop_commands(loops, each, dry, wet)
+        for each, dry, wet in zip(nodes, outdoor_c, wet_bulb_c, strict=True)
+    ]
+
+    def loops_at(step: int) -> F64 | None:
+        of_copies = [
+            np.repeat(x[step].T, len(each.setpoint_c), axis=1)
+            for x, each in zip(commands, nodes, strict=True)
+            if x is not None
+        ]
+        return np.concatenate(of_copies, axis=1) if of_copies else None
+
     place = np.repeat(np.arange(len(nodes)), [each.copies for each in nodes])
     of = np.array([each.dc for each in nodes])[place]
     facility = SteadyFacility(
@@ -194,7 +216,9 @@ def tabulate(
     )
     with closing(facility):
         throttles = _throttles(fleet, facility, of)
-        values = _through_weather(facility, place, outdoor_c, wet_bulb_c, throttles, on_step)
+        values = _through_weather(
+            facility, place, outdoor_c, wet_bulb_c, loops_at, throttles, on_step
+        )
     values["inlet_max_c"] = facility.inlet_max_c[None]
     firsts = np.cumsum([0, *(each.copies for each in nodes)])
     steps = outdoor_c.shape[1]
@@ -203,8 +227,9 @@ def tabulate(
             utilisation=each.utilisation,
             setpoint_c=each.setpoint_c,
             **{name: _of_one(x, int(first), steps, each) for name, x in values.items()},
+            loops=of_loops,
         )
-        for first, each in zip(firsts, nodes, strict=False)
+        for first, each, of_loops in zip(firsts, nodes, commands, strict=False)
     ]
 
 
@@ -246,6 +271,7 @@ def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
         config.servers,
         config.hvac.model_copy(update={"setpoint": first_c}),
         config.electrical,
+        config.liquid,
         config.protection,
         config.site.location,
         config.site.weather_file,
@@ -268,6 +294,7 @@ def _fine_enough(
     start: I64,
     steps: int,
     precision: Precision,
+    loops: LoopCommands | None,
 ) -> list[int]:
     """Choose the smallest sufficient number of utilisations for the table of each data center.
 
@@ -286,7 +313,7 @@ def _fine_enough(
             _series_of(series, batch, start, steps)[:, sampled]
             for series in (drivers.outdoor_c, drivers.wet_bulb_c)
         )
-        for table in tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision):
+        for table in tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, loops):
             errors = (
                 _error_midway(finest, table.facility_kwh, (len(finest) - 1) // (count - 1))
                 for count in UTILISATIONS[:-1]
@@ -320,11 +347,34 @@ def _series_of(series: FleetSeries, nodes: Sequence[Nodes], start: I64, steps: i
     return series.values.take(series.offsets[which, None] + index % series.lengths[which, None])
 
 
+def _loop_commands(
+    loops: LoopCommands | None, nodes: Nodes, outdoor_c: F64, wet_bulb_c: F64
+) -> F64 | None:
+    """Return the best commands of the loops of a data center, (T, I, 3); None holds the loops.
+
+    Args:
+        loops: Best commands of the loops of all data centers; None holds the loops.
+        nodes: Utilisations of the data center.
+        outdoor_c: Dry bulb of each step, in C, (T,).
+        wet_bulb_c: Wet bulb of each step, in C, (T,).
+    """
+    if loops is None:
+        return None
+    shape = len(outdoor_c), len(nodes.utilisation)
+    commands = loops.of(nodes.dc).at(
+        np.broadcast_to(outdoor_c[:, None], shape),
+        np.broadcast_to(wet_bulb_c[:, None], shape),
+        np.broadcast_to(nodes.utilisation, shape),
+    )
+    return np.moveaxis(commands, 0, 2)
+
+
 def _through_weather(
     facility: SteadyFacility,
     place: I64,
     outdoor_c: F64,
     wet_bulb_c: F64,
+    loops_at: Callable[[int], F64 | None],
     throttles: Mask,
     on_step: Callable[[int], None] | None,
 ) -> dict[str, F64]:
@@ -335,6 +385,8 @@ def _through_weather(
         place: Row of the weather for each copy, (B,).
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
+        loops_at: Function that returns the commands of the coolant loops in a step, (3, B), by its
+            number; None holds the loops.
         throttles: True for copies whose racks would throttle, (B,).
         on_step: Called after every step with the number of finished steps.
 
@@ -347,7 +399,8 @@ def _through_weather(
     # Usually all heat is removed in all steps; a single row of zeros then represents all of them.
     unmet_w = np.zeros((1, copies))
     for step in range(steps):
-        result = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
+        weather = outdoor_c[place, step], wet_bulb_c[place, step]
+        result = facility.at(*weather, loops_at(step))
         facility_kwh[step], water_l[step] = result.facility_kwh, result.water_l
         short_w = np.where(throttles, np.inf, result.unmet_w)
         if len(unmet_w) < steps and short_w.any():

@@ -9,9 +9,17 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.cache import key_of
+from sdc_taichi.optimum.loop_map import SAMPLES, LoopCommands
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
-from sdc_taichi.optimum.tables import UTILISATIONS, OnStep, facility_tables, setpoints_c
+from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent, Problem, problems_of
+from sdc_taichi.optimum.tables import (
+    UTILISATIONS,
+    OnStep,
+    facility_kwh,
+    facility_tables,
+    setpoints_c,
+)
+from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -79,9 +87,10 @@ class Task:
             where: indices of the data centers to divide.
         """
         part, size = list[int](), 0.0
+        tables = 2 if "liquid" in self.agents else 1
         for i in where:
             nodes = UTILISATIONS[0] * len(setpoints_c(self.fleet.configs[i]))
-            table_bytes = 4.0 * 8.0 * self.steps * nodes
+            table_bytes = 4.0 * 8.0 * self.steps * nodes * tables
             if part and size + table_bytes > MOST_TABLE_BYTES:
                 yield part
                 part, size = [], 0.0
@@ -121,26 +130,62 @@ class Task:
         Args:
             on_step: Progress callback ``(done, total)`` of the tables.
         """
-        tables = facility_tables(
-            self.fleet,
-            self.drivers,
-            start=self.start,
-            steps=self.steps,
-            precision=self.precision,
-            on_step=on_step,
+        kinds: list[LoopCommands | None] = [None]
+        if "liquid" in self.agents:
+            kinds.append(LoopCommands(self.fleet, self.drivers))
+        held, *moved = (
+            facility_tables(
+                self.fleet,
+                self.drivers,
+                start=self.start,
+                steps=self.steps,
+                precision=self.precision,
+                loops=loops,
+                on_step=on_step,
+            )
+            for loops in kinds
         )
         with Simulator(self.fleet, drivers=self.drivers, precision=self.precision) as sim:
-            return problems_of(
+            problems = problems_of(
                 self.fleet,
                 self.drivers,
                 sim.sizing,
-                tables,
+                moved[0] if moved else held,
                 start=self.start,
                 objective=self.objective,
                 agents=self.agents,
                 scored_from=self.scored_from,
                 inlet_limit_c=self.inlet_limit_c,
+                held=held if moved else None,
             )
+        if kinds[-1] is None:
+            return problems
+        errors = (self._loops_error(dc, kinds[-1], each) for dc, each in enumerate(problems))
+        return [
+            replace(problem, loops_error=error)
+            for problem, error in zip(problems, errors, strict=True)
+        ]
+
+    def _loops_error(self, dc: int, loops: LoopCommands, problem: Problem) -> float:
+        """Return by how much the energy of the commands of coolant loops exceeds the least one.
+
+        It is the mean of steps under idle commands plus two standard errors, relative.
+        """
+        if self.fleet.configs[dc].liquid is None:
+            return 0.0
+        utilisation = np.minimum(problem.work.idle_tasks / TASKS_PER_STEP, 1.0)
+        kwh = facility_kwh(problem.table, utilisation, problem.idle_setpoint_c)
+        scored = self.steps - self.scored_from
+        chosen = np.linspace(self.scored_from, self.steps - 1, min(SAMPLES, scored)).astype(int)
+        outdoor_c, wet_bulb_c = (
+            series.at(self.start[:, None] + chosen)[dc]
+            for series in (self.drivers.outdoor_c, self.drivers.wet_bulb_c)
+        )
+        excess_w = loops.excess_w(dc, outdoor_c, wet_bulb_c, utilisation[chosen])
+        if np.isinf(excess_w).any():
+            return np.inf
+        share = excess_w * problem.step_h / 1e3 / kwh[chosen]
+        return float(share.mean() + 2.0 * share.std() / np.sqrt(len(chosen)))
 
 
 def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
@@ -169,15 +214,23 @@ def checked_start(start: I64 | Sequence[int], size: int) -> I64:
     return first.astype(np.int64)
 
 
-def checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
-    """Check names of agents and return them in the order of ``AGENTS``.
+def checked_agents(agents: Sequence[Agent] | None, fleet: Fleet) -> tuple[Agent, ...]:
+    """Check names of agents and return them in the order of ``ALL_AGENTS``.
+
+    Args:
+        agents: the names; None stands for all agents of the fleet.
+        fleet: the data centers.
 
     Raises:
-        ConfigError: there is no name, or a name is unknown or repeated.
+        ConfigError: there is no name, or a name is unknown or repeated, or no data center has
+            coolant loops.
     """
+    known = ALL_AGENTS if fleet.cdus else AGENTS
+    if agents is None:
+        return known
     named = (agents,) if isinstance(agents, str) else tuple(agents)
-    if not named or len(set(named)) < len(named) or not set(named) <= set(AGENTS):
+    if not named or len(set(named)) < len(named) or not set(named) <= set(known):
         raise ConfigError(
-            f"agents {list(named)!r}: valid is one or more of {', '.join(AGENTS)}, each once"
+            f"agents {list(named)!r}: valid is one or more of {', '.join(known)}, each once"
         )
-    return tuple(agent for agent in AGENTS if agent in named)
+    return tuple(agent for agent in known if agent in named)

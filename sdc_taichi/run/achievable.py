@@ -18,7 +18,7 @@ from sdc_taichi.control import PERFECT, Controller, ForecastError, View
 from sdc_taichi.errors import SdcError
 from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.rollout import LEAST_K, broken_constraints
+from sdc_taichi.optimum.rollout import LEAST_K, broken_constraints, loop_commands
 from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import finite_or_none
@@ -47,7 +47,12 @@ class AchievedPath:
         step, of = view.state.step, self._optimum
         if step >= of.steps:
             raise SdcError(f"step {step} of an optimum of {of.steps} steps")
-        return Actions(load=of.load[step], cooling=of.cooling[step], battery=of.battery[step])
+        return Actions(
+            load=of.load[step],
+            cooling=of.cooling[step],
+            battery=of.battery[step],
+            **loop_commands(of.loops, view.state, view.fleet),
+        )
 
 
 @dataclass(frozen=True, slots=True)

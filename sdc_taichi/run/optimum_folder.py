@@ -150,7 +150,7 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
     remarks = ["Achieved: what the simulator reached with all inputs known in advance."]
     if any(dc["bound_kind"] == _BOUND for dc in dcs):
         moved = content["agents"]
-        of = "" if len(moved) == len(AGENTS) else f" of {' and '.join(moved)} alone"
+        of = f" of {' and '.join(moved)} alone" if set(AGENTS) - set(moved) else ""
         remarks.insert(
             0,
             f"Bound: with these inputs, no controller{of} that keeps the constraints and ends as "

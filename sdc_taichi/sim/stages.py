@@ -146,8 +146,8 @@ class SteadyStep:
     water_l: F64
     """Make-up water, in l, (B,)."""
     unmet_w: F64
-    """Cooling load that is not removed, in W, (B,); inf if a result is beyond its physical
-    limits."""
+    """Cooling load that is not removed, in W, (B,); inf if GPUs throttle or a result is beyond its
+    physical limits."""
 
 
 class SteadyFacility:
@@ -181,7 +181,7 @@ class SteadyFacility:
             # The same warnings have been issued for the originals.
             warnings.simplefilter("ignore", OddInputWarning)
             fleet = build_fleet(_copies(configs, of, setpoint_c))
-        self._step_h = 1.0 / fleet.steps_per_hour
+        self._step_h, self._cdu_dc = 1.0 / fleet.steps_per_hour, fleet.cdu_dc
         # ``at`` sets the weather; carbon intensity and price do not affect its results.
         still = FleetSeries(np.zeros(1), np.zeros_like(of), np.ones_like(of))
         inputs = replace(
@@ -220,13 +220,19 @@ class SteadyFacility:
         )
         """Highest server outlet temperature of each copy, in C, (B,)."""
 
-    def at(self, outdoor_c: F64, wet_bulb_c: F64) -> SteadyStep:
+    def at(self, outdoor_c: F64, wet_bulb_c: F64, loops: F64 | None = None) -> SteadyStep:
         """Run one step in the given weather.
 
         Args:
             outdoor_c: Outdoor dry bulb, in C, (B,).
             wet_bulb_c: Outdoor wet bulb, in C, (B,).
+            loops: Supply setpoint of the CDUs in C, flow divided by the design flow, and approach
+                of the facility water in K, (3, B); None keeps those of the configs.
         """
+        if loops is not None:
+            setpoint_c, flow = loops[:2, self._cdu_dc]
+            self._state = replace(self._state, cdu_setpoint_c=setpoint_c, cdu_flow=flow)
+            self._commands = replace(self._commands, facility_approach_k=loops[2])
         self._surroundings.outdoor_c, self._surroundings.wet_bulb_c = outdoor_c, wet_bulb_c
         if self._liquid is not None:
             # The heat that liquid-cooled racks leave to the air depends on the weather.
@@ -239,11 +245,12 @@ class SteadyFacility:
             self._air,
             self._liquid,
         )
+        throttles = self._liquid is not None and self._liquid.throttled_tasks > 0.0
         possible = (results["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
         return SteadyStep(
             facility_kwh=results["it_kwh"] + results["overhead_w"] * self._step_h / 1e3,
             water_l=results["water_l"],
-            unmet_w=np.where(possible, results["unmet_w"], np.inf),
+            unmet_w=np.where(possible & ~throttles, results["unmet_w"], np.inf),
         )
 
     def close(self) -> None:
