@@ -33,13 +33,15 @@ from sdc_taichi.control import (
     commands_of,
     controller_names,
     make_controller,
+    parts_of,
     register_controller,
     registry,
     trim_and_respond,
     view_maker,
 )
 from sdc_taichi.control.hall_rules import HALL_RULES
-from sdc_taichi.control.rules import FixedSetpoint, quartile_command, slots_in_step
+from sdc_taichi.control.registry import RULES, RULES_SPEC
+from sdc_taichi.control.rules import FixedSetpoint, rank_command, slots_in_step
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.run.loop import simulate
@@ -178,10 +180,10 @@ def test_fixed_setpoints_are_reached_at_once_and_kept(
 def test_quarters_of_a_window() -> None:
     rising = np.arange(12.0)
     rows = [rising, rising[::-1], np.ones(12), np.r_[5.0, np.zeros(6), np.full(5, 9.0)]]
-    assert quartile_command(np.array(rows)).tolist() == [1.0, -1.0, 0.0, 0.0]
+    assert rank_command(np.array(rows), 0.25).tolist() == [1.0, -1.0, 0.0, 0.0]
     # Two of eight are lower: no longer in the lowest quarter.
-    assert quartile_command(np.array([[2.0, 0, 1, 3, 3, 3, 3, 3]])).tolist() == [0.0]
-    assert quartile_command(np.array([[2.0, 0, 3, 3, 3, 3, 3, 3]])).tolist() == [1.0]
+    assert rank_command(np.array([[2.0, 0, 1, 3, 3, 3, 3, 3]]), 0.25).tolist() == [0.0]
+    assert rank_command(np.array([[2.0, 0, 3, 3, 3, 3, 3, 3]]), 0.25).tolist() == [1.0]
 
 
 @pytest.mark.parametrize("name", ["lookahead-3h", "lookahead-24h"])
@@ -205,6 +207,56 @@ def test_lookahead_trades_only_for_more_than_the_battery_loses(wave_g: float, tr
     with Simulator(config, drivers=drivers) as sim:
         kept = results(sim, make_controller("lookahead-24h", sim.fleet), 200)
     assert any(np.any(r.battery_command) for r in kept) is trades
+
+
+def test_rank_ranks_work_and_battery_by_the_objective() -> None:
+    with Simulator(load_config("corrected", ["site.location=CA"])) as sim:
+        sim.reset()
+        views = view_maker(sim)
+        controllers = {
+            name: make_controller(name, sim.fleet)
+            for name in (
+                "rank-24h:0.3",
+                "rank-24h:0.3:cost",
+                "battery=rank-24h:0.25",
+                "lookahead-24h",
+            )
+        }
+        result = None
+        for _ in range(96):
+            view = views(result)
+            acts = {name: controller.act(view) for name, controller in controllers.items()}
+            forecast = view.forecast(24)
+            for name, values in (
+                ("rank-24h:0.3", forecast.ci_g_per_kwh),
+                ("rank-24h:0.3:cost", forecast.price_per_kwh),
+            ):
+                assert acts[name].load == rank_command(values, 0.3)
+                assert acts[name].battery in (0.0, acts[name].load)
+            assert acts["battery=rank-24h:0.25"].battery == acts["lookahead-24h"].battery
+            assert (
+                acts["lookahead-24h"].load == acts["battery=rank-24h:0.25"].load == Actions().load
+            )
+            result = sim.step(acts["rank-24h:0.3"])
+
+
+@pytest.mark.parametrize(
+    "name", ["rank-24h:0.6", "rank-0h", "rank-h", "rank-24h:0.3:water", "rank-24h:0.3:nothing"]
+)
+def test_rank_refuses_what_it_cannot_rank(name: str) -> None:
+    with Simulator(load_config("tiny")) as sim, pytest.raises(ConfigError, match="valid"):
+        make_controller(name, sim.fleet)
+    with Simulator(load_config("tiny")) as sim, pytest.raises(ConfigError, match="not act on cool"):
+        make_controller("cooling=rank-24h", sim.fleet)
+
+
+def test_rules_stand_for_a_rule_for_each_agent() -> None:
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        view = view_maker(sim)(None)
+        acts = [make_controller(name, sim.fleet).act(view) for name in (RULES, RULES_SPEC)]
+    assert acts[0] == acts[1]
+    assert {*parts_of(RULES)} == {"load", "cooling", "battery"}
 
 
 def test_greedy_follows_the_mean_of_the_coming_day() -> None:

@@ -132,8 +132,10 @@ class Row(Section):
     """Description of the row in one sentence."""
     controller: Annotated[str, Field(min_length=1)] | None = None
     """Name of a controller, such as ``g36`` or ``load=greedy-ci,cooling=g36``."""
-    best_of: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
-    """Names of controllers; the row uses the one with the best result in the validation weeks."""
+    best_of: tuple[Annotated[str, Field(min_length=1)], ...] | Literal["rules"] | None = None
+    """Names of controllers, of which the row uses the one with the best result in the validation
+    weeks; or ``rules`` for a rule for each agent that ``benchmark.rules_search`` finds in these
+    weeks."""
     train: dict[str, Any] | None = None
     """Settings of a training, as for ``sdc-taichi train``; they take precedence over those of the
     case and of the suite."""
@@ -165,8 +167,8 @@ class Row(Section):
                 raise ValueError(f"{name}: valid with train")
         if self.best_of is not None and not self.best_of:
             raise ValueError("best_of: none given; valid is one or more")
-        if self.best_of is not None and len(set(self.best_of)) < len(self.best_of):
-            raise ValueError(f"best_of: {', '.join(self.best_of)}; valid is each once")
+        if len(set(self.controllers)) < len(self.controllers):
+            raise ValueError(f"best_of: {', '.join(self.controllers)}; valid is each once")
         if self.forecast_error is not None:
             if self.optimum is not None:
                 raise ValueError("forecast_error: without effect on an optimum; valid is without")
@@ -176,7 +178,9 @@ class Row(Section):
     @property
     def controllers(self) -> tuple[str, ...]:
         """Names of the controllers in ``controller`` or ``best_of``."""
-        return (self.controller,) if self.controller is not None else self.best_of or ()
+        if self.controller is not None:
+            return (self.controller,)
+        return self.best_of if isinstance(self.best_of, tuple) else ()
 
     @property
     def is_random(self) -> bool:

@@ -26,6 +26,7 @@ from sdc_taichi.benchmark.cases import (
 )
 from sdc_taichi.benchmark.jobs import Inputs, JobResult
 from sdc_taichi.benchmark.result_table import read_suite_rows
+from sdc_taichi.benchmark.rules_search import best_rules
 from sdc_taichi.benchmark.store import METRICS_FILE, ROWS_FILE, Record
 from sdc_taichi.benchmark.suite import Case, Part, Row
 from sdc_taichi.benchmark.suite_results import RowMetrics
@@ -219,13 +220,18 @@ def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
         return _trained(task, scratch, optima)
     if task.row.best_of is None:
         return _Made(task.row.controller or "", {}, {})
+    changes: dict[str, float] = {}
     with _weeks(task, "validation", optima) as weeks:
-        tried = {
-            spec: validate(make_controller(spec, weeks.sim.fleet), weeks)
-            for spec in task.row.best_of
-        }
-    best = min(tried, key=lambda spec: tried[spec].change_pct)
-    changes = {spec: validation.change_pct for spec, validation in tried.items()}
+
+        def change_pct(spec: str) -> float:
+            controller = make_controller(spec, weeks.sim.fleet)
+            changes[spec] = validate(controller, weeks).change_pct
+            return changes[spec]
+
+        if task.row.best_of == "rules":
+            best = best_rules(task.objective, change_pct)
+        else:
+            best = min(task.row.best_of, key=change_pct)
     return _Made(best, {"chosen": best, "validation_change_pct": changes}, {})
 
 

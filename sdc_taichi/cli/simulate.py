@@ -162,13 +162,14 @@ def simulate_command(
     controller: Annotated[
         str,
         controllers_option(
-            "idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
-            "greedy-ci, follow, local-pi, common-pi, g36-trim-respond, one-speed, geo-central, "
-            "geo-all-to-cleanest, geo-three-cleanest, geo-all-cleaner, geo-mpc, liquid-wet-bulb, "
-            "liquid-reset, liquid-greedy, mpc-24h, policy:FOLDER; or module:name of your own; or "
-            "per agent, such as load=greedy-ci,cooling=g36,battery=policy:runs/happo; geo-... is "
-            "for fleets, liquid-... for coolant loops, and follow to one-speed are for fans that "
-            "are controlled."
+            "idle, rules, random, g36, coldest, warmest, constant:C, lookahead-3h, "
+            "lookahead-24h, rank-24h:0.3, greedy-ci, follow, local-pi, common-pi, "
+            "g36-trim-respond, one-speed, geo-central, geo-all-to-cleanest, geo-three-cleanest, "
+            "geo-all-cleaner, geo-mpc, liquid-wet-bulb, liquid-reset, liquid-greedy, mpc-24h, "
+            "policy:FOLDER; or module:name of your own; or per agent, such as "
+            "load=greedy-ci,cooling=g36,battery=policy:runs/happo; geo-... is for fleets, "
+            "liquid-... for coolant loops, and follow to one-speed are for fans that are "
+            "controlled."
         ),
     ] = "idle",
     run: ForecastRunOptions,

@@ -22,7 +22,7 @@ from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
-from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.objective import CARBON, Objective
 from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.bills import BilledDemand, add_power, no_demand
@@ -37,8 +37,6 @@ LOOP_STEP_K = 0.5
 """Spacing of the candidate supply setpoints of CDUs, in K."""
 HORIZON_H = (1.0, 168.0)
 """Shortest and longest horizon, in h."""
-CARBON = Objective(carbon=1.0)
-"""Objective of a controller whose name does not state one."""
 SETPOINT_STEP_K = 0.5
 """Largest spacing of the candidate setpoints, in K."""
 KNOWN_DAYS = 7

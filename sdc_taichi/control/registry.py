@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -26,9 +27,9 @@ from sdc_taichi.control.rules import (
     FixedSetpoint,
     GreedyCarbon,
     Idle,
-    Lookahead,
     PerAgent,
     Random,
+    Rank,
     TrimAndRespond,
     commands_of,
 )
@@ -41,6 +42,7 @@ from sdc_taichi.errors import (
     suggestion_or_valid,
 )
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.optimum.objective import CARBON, Objective
 from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import check_code, import_path, imported, register_function
@@ -71,8 +73,8 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "g36": _NamedController(TrimAndRespond, ("cooling",)),
     "coldest": _NamedController(lambda: FixedSetpoint("low"), ("cooling",)),
     "warmest": _NamedController(lambda: FixedSetpoint("high"), ("cooling",)),
-    "lookahead-3h": _NamedController(lambda: Lookahead(3.0), ("battery",)),
-    "lookahead-24h": _NamedController(lambda: Lookahead(24.0), ("battery",)),
+    "lookahead-3h": _NamedController(lambda: Rank(3.0, commands=("battery",)), ("battery",)),
+    "lookahead-24h": _NamedController(lambda: Rank(24.0, commands=("battery",)), ("battery",)),
     "greedy-ci": _NamedController(GreedyCarbon, ("load", "battery")),
     "geo-all-to-cleanest": _NamedController(lambda: Alone(all_to_cleanest), ("geo",)),
     "geo-three-cleanest": _NamedController(lambda: Alone(three_cleanest), ("geo",)),
@@ -83,13 +85,20 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "liquid-greedy": _NamedController(GreedyLoops, ("liquid",)),
     "geo-mpc": _NamedController(lambda: _fleet_predictive(), ("load", "cooling", "geo")),
 }
+RULES = "rules"
+"""Name that stands for ``RULES_SPEC``."""
+RULES_SPEC = "load=rank-48h:0.3,cooling=constant:21,battery=rank-12h:0.2"
+"""A rule for each agent: what ``benchmark.rules_search`` finds for carbon in the validation weeks
+of suite ``carbon``, with the best setpoint that every preset allows."""
 _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
+_RANK = "rank-24h"
+_RANK_NAME = re.compile(r"rank-(?P<hours>[^:]*)h(?::(?P<share>[^:]*)(?::(?P<objective>.*))?)?")
 _POLICY = "policy:FOLDER"
 _registered: dict[str, Any] = {"policy": "sdc_taichi.learning.controller:policy_controller"}
 """Registered makers, or their import paths, by the part of a controller name before the colon.
 Import paths are resolved on first use."""
-_BUILT_IN = (*_CONTROLLERS, *HALL_RULES, "constant", "policy")
+_BUILT_IN = (RULES, *_CONTROLLERS, *HALL_RULES, "constant", "policy")
 _SUGGESTION = " (did you mean {!r}?)"
 
 
@@ -97,12 +106,13 @@ def controller_names() -> tuple[str, ...]:
     """Return the valid controller names.
 
     ``follow`` and other rules for CRAC units take temperatures, see ``control.hall_rules``.
-    ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``mpc-24h`` for any
-    horizon and objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a training
-    run or a policy. An import path ``module:name`` is also valid.
+    ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``rank-24h`` for any
+    window, share and objective, such as ``rank-12h:0.3:cost``; ``mpc-24h`` for any horizon and
+    objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a
+    training run or a policy. An import path ``module:name`` is also valid.
     """
     added = (name for name in _registered if name not in _BUILT_IN)
-    return (*_CONTROLLERS, *HALL_RULES, _CONSTANT, _MPC, _POLICY, *added)
+    return (*_CONTROLLERS, *HALL_RULES, RULES, _CONSTANT, _RANK, _MPC, _POLICY, *added)
 
 
 def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> None:
@@ -132,6 +142,7 @@ def is_path(name: str) -> bool:
     """Return True if a controller's name is an import path, False if it begins with a name."""
     kind, colon, _ = name.partition(":")
     is_named = kind in (*_registered, "constant") or is_mpc(name) or is_hall_rule(name)
+    is_named |= name.startswith("rank-")
     return bool(colon) and not is_named
 
 
@@ -166,11 +177,13 @@ def make_controller(spec: str | Controller, fleet: Fleet, *, allow_code: bool = 
 def parts_of(spec: str) -> dict[str, str]:
     """Return the controller names by agent in a spec such as ``load=greedy-ci,cooling=g36``.
 
-    The result is empty for a plain name.
+    The result is empty for a plain name, except for ``rules``, which stands for such a spec.
 
     Raises:
         ConfigError: An agent is unknown or appears twice.
     """
+    if spec.strip() == RULES:
+        spec = RULES_SPEC
     first, sign, _ = spec.partition("=")
     if not sign or ":" in first:
         return {}
@@ -245,6 +258,9 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
         known = ALL_AGENTS if fleet.cdus else AGENTS
         agents = tuple(a for a in known if parts is None or a in parts)
         entry = _NamedController(lambda: model_predictive(name, agents), ALL_AGENTS)
+    elif name.startswith("rank-"):
+        commands = tuple(a for a in ("load", "battery") if parts is None or a in parts)
+        entry = _NamedController(lambda: _rank(name, commands), ("load", "battery"))
     elif kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
     elif is_hall_rule(name):
@@ -261,7 +277,7 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
             "geo": [],
             "liquid": [_MPC, _POLICY],
         }
-        able += of_part.get(agent, [_MPC, _POLICY])
+        able += of_part.get(agent, [_RANK, _MPC, _POLICY])
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )
@@ -273,6 +289,26 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
     if name.startswith("liquid-"):
         require_liquid(name, fleet)
     return entry.make()
+
+
+def _rank(name: str, commands: tuple[str, ...]) -> Controller:
+    """Make a rule by rank from a name such as ``rank-24h:0.3`` or ``rank-24h:0.3:cost``."""
+    match = _RANK_NAME.fullmatch(name)
+    try:
+        hours, share = (
+            parse_number(match[x] or "0.25") if match else 0.0 for x in ("hours", "share")
+        )
+    except ValueError:
+        hours = share = math.nan
+    if match is None or not hours >= 1.0 or not 0.0 < share <= 0.5:
+        raise ConfigError(
+            f"controller {name!r}: valid is rank-HOURSh:SHARE or rank-HOURSh:SHARE:OBJECTIVE with "
+            "1 h or more and a share above 0 and up to 0.5, such as rank-24h:0.3:cost"
+        )
+    objective = CARBON if match["objective"] is None else Objective.parse(match["objective"])
+    if objective.water or objective.heat:
+        raise ConfigError(f"controller {name!r}: valid are carbon, energy, cost, and sums of them")
+    return Rank(hours, share, objective=objective, commands=commands)
 
 
 def _fleet_predictive() -> Controller:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C
+from sdc_taichi.optimum.objective import CARBON, Objective
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
@@ -168,29 +169,43 @@ class FixedSetpoint(WithoutMemory):
         return Actions(cooling=setpoint_command(target_c, view))
 
 
-class Lookahead(WithoutMemory):
-    """Battery controller that compares the carbon intensity with its forecast for a time window.
+class Rank(WithoutMemory):
+    """Controller of work and battery by the rank of the present value of a kWh in a coming window.
 
-    The battery charges at full power if the present intensity is in the lowest quarter of the
-    window, and discharges if it is in the highest quarter. Otherwise the battery idles. It also
-    idles if the ratio of the lowest to the highest intensity exceeds the round-trip efficiency.
-    Carbon Explorer schedules storage by forecasts in the same way (Acun et al., ASPLOS 2023).
+    If the present carbon intensity, or price, is among the lowest of the window, the queue drains
+    and the battery charges at full power. If it is among the highest, work is deferred and the
+    battery discharges. The battery idles if the ratio of the lowest to the highest value exceeds
+    the round-trip efficiency. Carbon Explorer schedules storage by forecasts in the same way (Acun
+    et al., ASPLOS 2023).
 
     Args:
-        hours: length of the window, in h.
+        hours: Length of the window, in h.
+        share: Share of the window that counts as lowest, and as highest, 0..0.5.
+        objective: Quantity of which a kWh has the value that is ranked, such as carbon or cost.
+        commands: Commands that the controller gives, of ``load`` and ``battery``.
     """
 
-    commands = ("battery",)
-    """Fields of ``Actions`` that it gives."""
-
-    def __init__(self, hours: float) -> None:
-        self._hours = hours
+    def __init__(
+        self,
+        hours: float,
+        share: float = 0.25,
+        *,
+        objective: Objective = CARBON,
+        commands: tuple[str, ...] = ("load", "battery"),
+    ) -> None:
+        self._hours, self._share, self._objective = hours, share, objective
+        self.commands = commands
+        """Fields of ``Actions`` that it gives."""
 
     def act(self, view: View) -> Actions:
-        """Return battery commands only."""
-        ci = view.forecast(self._hours).ci_g_per_kwh
-        pays = ci.max(axis=1) * view.limits.battery_round_trip > ci.min(axis=1)
-        return Actions(battery=np.where(pays, quartile_command(ci), 0.0))
+        """Return commands for work and battery."""
+        forecast = view.forecast(self._hours)
+        values = self._objective.kwh_weight(forecast.ci_g_per_kwh, forecast.price_per_kwh)
+        pays = values.max(axis=1) * view.limits.battery_round_trip > values.min(axis=1)
+        command = rank_command(values, self._share)
+        battery = np.where(pays, command, 0.0)
+        given = {"load": command, "battery": battery}
+        return Actions(**{name: given[name] for name in self.commands})
 
 
 class GreedyCarbon(WithoutMemory):
@@ -353,20 +368,21 @@ def setpoint_command(target_c: F64, view: View) -> F64:
     return avoid_repeats(command, view.cooling_last)
 
 
-def quartile_command(ci_g_per_kwh: F64) -> F64:
-    """Return a battery command by the rank of the present carbon intensity within a window.
+def rank_command(values: F64, share: float) -> F64:
+    """Return a command by the rank of the present value within a window.
 
-    A value is in the lowest quarter of n values if fewer than n/4 of them are lower. A value in
-    both the lowest and the highest quarter, as in a constant window, gives 0.
+    A value is among the lowest of n values if fewer than ``share`` n of them are lower. A value
+    that is among both the lowest and the highest, as in a constant window, gives 0.
 
     Args:
-        ci_g_per_kwh: Carbon intensity in the window, g CO2e/kWh, present value first, (B, n).
+        values: Values in the window, present value first, (B, n).
+        share: Share of the window that counts as lowest, and as highest.
 
     Returns:
-        1 (charge) in the lowest quarter, -1 (discharge) in the highest, else 0, (B,).
+        1 among the lowest, -1 among the highest, else 0, (B,).
     """
-    now, quarter = ci_g_per_kwh[:, :1], ci_g_per_kwh.shape[1] / 4.0
-    low = np.count_nonzero(ci_g_per_kwh < now, axis=1) < quarter
-    high = np.count_nonzero(ci_g_per_kwh > now, axis=1) < quarter
+    now, count = values[:, :1], share * values.shape[1]
+    low = np.count_nonzero(values < now, axis=1) < count
+    high = np.count_nonzero(values > now, axis=1) < count
     command: F64 = low.astype(np.float64) - high.astype(np.float64)
     return command

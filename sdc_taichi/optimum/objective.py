@@ -146,6 +146,10 @@ class Objective:
         return without_heat + self.heat * heat_kh if self.heat else without_heat
 
 
+CARBON = Objective(carbon=1.0)
+"""Objective of controllers whose name does not state one."""
+
+
 def _shortest(weight: float) -> str:
     """Return the shortest text, without plus signs, that ``float`` converts to this number."""
     return repr(float(weight)).removesuffix(".0").replace("e+", "e")
