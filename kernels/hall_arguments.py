@@ -109,6 +109,7 @@ RACK_INPUTS = {
     "exhaust_share": "share of exhaust in the intake at the design point, r of docs/hall.md",
     "present_exhaust_share": "exhaust_share at the present excess of supply (if units exceed)",
     "per_server": "reciprocal of the rack's number of servers, 0 in padding",
+    "heat_w": "heat of a server without fans, if given per rack, else 0; W (liquid-cooled racks)",
 }
 GROUP_INPUTS = {
     "count": "number of servers in the group, 0 if the rack has no such group",

@@ -90,6 +90,7 @@ def broadcast_rack(
     of_racks.cpu_base = ti.Vector([racks.cpu_base[lane]] * LANES)
     of_racks.fan_base = ti.Vector([racks.fan_base[lane]] * LANES)
     of_racks.fan_low = ti.Vector([racks.fan_low[lane]] * LANES)
+    of_racks.heat_w = ti.Vector([racks.heat_w[lane]] * LANES)
     of_racks.powered = ti.Vector([racks.powered[lane]] * LANES)
     of_racks.full_m3s = ti.Vector([racks.full_m3s[lane]] * LANES)
     of_racks.full_fan_w = ti.Vector([racks.full_fan_w[lane]] * LANES)

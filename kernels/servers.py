@@ -179,6 +179,7 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
+        heat_w=block.heat_w,
         # Indices of the first and last group in group_load, if loads are given per group.
         first_group=first_group,
         last_group=last_group,
@@ -245,7 +246,7 @@ def compute_group(
     airflow = add_knees(hall, servers, (0, fan_knees), on_curve_c, load, fan_line)
     cpu_line = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
     cpu_ratio = add_knees(hall, servers, (fan_knees, n_knees), on_curve_c, load, cpu_line)
-    cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
+    cpu_w = larger(larger(group.idle_w, racks.heat_w), group.full_w * cpu_ratio)
     airflow = smaller(larger(airflow, racks.fan_low), servers.fan_high)
     fan_power = airflow
     if servers.fan_exponent == hall.real(3.0):

@@ -52,7 +52,7 @@ from sdc_taichi.sim.sampled_halls import (
     sparse_halls,
     supply_range_c,
 )
-from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
+from sdc_taichi.types import F64, I32, I64, HallQuantities, Reals, ServerLayers
 
 _FIRST_CONTROL = [
     np.array(
@@ -355,24 +355,26 @@ class Hall:
         """Let the heat of some racks be an input of each step, see ``set_heat``.
 
         Args:
-            racks: Indices of these racks, whose blocks share no group inputs with others.
+            racks: Indices of the liquid-cooled racks. The servers of each are equal.
         """
         fleet, arrays = self._fleet, self._tables.arrays
         first, counts = fleet.group_offsets[racks], np.diff(fleet.group_offsets)[racks]
-        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        place = self._places.of_racks[racks]
-        row = self._tables.rows("block_ints")["first_row"][place // LANES]
-        entry = (np.repeat(row, counts) + number) * len(GROUP_INPUTS)
-        lane = np.repeat(place % LANES, counts)
-        groups = np.repeat(first, counts) + number
+        in_rack, groups = _each(first, counts)
         rows = np.concatenate(fleet.group_rows, axis=1)[:, groups]
         count, full_w = (rows[row_index(GROUP_INPUTS, name)] for name in ("count", "full_w"))
-        in_rack = np.repeat(np.arange(len(racks)), counts)
         of_rack_w = np.bincount(in_rack, count * full_w)
-        self._heat_rack, self._heat_share = in_rack, full_w / of_rack_w[in_rack]
-        self._heat_at = (entry + row_index(GROUP_INPUTS, "idle_w")) * LANES + lane
-        at_full_w = (entry + row_index(GROUP_INPUTS, "full_w")) * LANES + lane
-        arrays["group_inputs"].reshape(-1)[at_full_w] = 0.0
+        self._heat_share = full_w[np.cumsum(counts) - counts] / of_rack_w
+        self._heat_places = self._places.of_racks[racks]
+        block, of_blocks = self._heat_places // LANES, self._tables.rows("block_ints")
+        in_rack, entries = _each(of_blocks["first_row"][block], of_blocks["groups"][block])
+        inputs = arrays["group_inputs"].reshape(-1, len(GROUP_INPUTS), LANES)
+        places = self._heat_places[in_rack]
+        full, idle = (row_index(GROUP_INPUTS, name) for name in ("full_w", "idle_w"))
+        self._rack["heat_w"][places] = inputs[entries, idle, places % LANES]
+        for row in (full, idle):
+            inputs[entries, row, places % LANES] = 0.0
+        # Layers read copies of the group inputs.
+        self._has_rows_along_racks = False
 
     def set_heat(self, rack_w: F64) -> None:
         """Set the heat of the racks of ``take_heat_of`` while they are on, without fans.
@@ -380,10 +382,7 @@ class Hall:
         Args:
             rack_w: Heat of each of these racks, in W.
         """
-        inputs = self._tables.arrays["group_inputs"].reshape(-1)
-        inputs[self._heat_at] = self._heat_share * rack_w[self._heat_rack]
-        # Layers read copies of the group inputs.
-        self._has_rows_along_racks = False
+        self._rack["heat_w"][self._heat_places] = self._heat_share * rack_w
 
     @property
     def sweeps(self) -> I32:
@@ -1123,6 +1122,16 @@ def _group_parts(fleet: Fleet) -> F64:
     count, full = (row_index(GROUP_INPUTS, name) for name in ("count", "full_airflow"))
     airflow = np.concatenate([rows[count] * rows[full] for rows in fleet.group_rows])
     return airflow / np.repeat(fleet.group_sums(airflow), np.diff(fleet.group_offsets))
+
+
+def _each(first: I32, counts: I32) -> tuple[I64, I64]:
+    """Return the items of ranges, given by their first items and lengths, one after another.
+
+    Returns:
+        Index of the range of each item, and the items.
+    """
+    of_range = np.repeat(np.arange(len(counts)), counts)
+    return of_range, np.arange(len(of_range)) + (first - (np.cumsum(counts) - counts))[of_range]
 
 
 def _condition_shapes(fleet: Fleet) -> dict[str, tuple[int]]:

@@ -301,12 +301,11 @@ def _build_group_inputs(
     row_of_block: dict[Any, int] = {}
     blocks_of_hall: dict[int, slice] = {}
     entries, first_row, total = [], np.zeros(len(groups), np.int64), 0
-    is_liquid = np.zeros(len(groups), np.bool_)
-    is_liquid[places.of_racks[fleet.liquid_racks] // LANES] = True
+    is_liquid = np.zeros((len(groups), LANES), np.bool_)
+    is_liquid.reshape(-1)[places.of_racks[fleet.liquid_racks]] = True
     for dc, (begin, end) in enumerate(pairwise(places.block_offsets)):
         rows, blocks = fleet.group_rows[dc], slice(begin, end)
-        # The heat of liquid-cooled racks is an input, so their blocks do not share entries.
-        same = blocks if is_liquid[blocks].any() else blocks_of_hall.setdefault(id(rows), blocks)
+        same = blocks_of_hall.setdefault(id(rows), blocks)
         if same != blocks:
             first_row[blocks] = first_row[same]
             continue
@@ -317,7 +316,9 @@ def _build_group_inputs(
             end_rack = first_rack[i] + racks[i]
             offsets = fleet.group_offsets[first_rack[i] : end_rack + 1] - group_0
             values = rows[:, offsets[0] : offsets[-1]]
-            key = (values.tobytes(), (offsets - offsets[0]).tobytes(), i if is_liquid[i] else -1)
+            # Heat of liquid-cooled racks is an input per rack, see ``Hall.take_heat_of``.
+            groups_of_racks = (offsets - offsets[0]).tobytes()
+            key = values.tobytes(), groups_of_racks, is_liquid[i].tobytes()
             if key not in row_of_block:
                 row_of_block[key] = total
                 entries.append(_block_entry(rows, offsets, groups[i], dtype))
@@ -647,6 +648,7 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
         "exhaust_share": 0.0 * ones if air is None else air.exhaust_share,
         "present_exhaust_share": 0.0 * ones,
         "per_server": 1.0 / fleet.per_rack_servers(),
+        "heat_w": 0.0 * ones,
     }
     out = vectors(dtype, len(RACK_INPUTS), places.count // LANES)
     rows = out.reshape(len(out), -1)
