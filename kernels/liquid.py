@@ -516,6 +516,7 @@ def _set_valves(liquid: ti.template(), dc, m, most_open, water_c):
         liquid.cdus[c].is_full = 0.0
         c += liquid.one
     k_sum, water, passes = liquid.real(0.0), liquid.real(0.0), 0
+    last = _no_valve(liquid)
     # A CDU whose valve is fully open may give less heat to the facility water than its setpoint
     # needs; the other CDUs of the manifold then give the rest.
     while passes < 3:
@@ -530,7 +531,7 @@ def _set_valves(liquid: ti.template(), dc, m, most_open, water_c):
                 if loop.heat_w > 0.0:
                     cooled_k = ti.max(return_c - setpoint_c, 0.0)
                     wanted = cdu.w_per_k * cooled_k / (return_c - water_c)
-                valve, k = _cdu_valve(liquid, c, wanted, most_open)
+                valve, k = _cdu_valve(liquid, c, wanted, most_open, last)
                 cdu.valve = valve
                 cdu.k_w_per_k = k
                 if end - first > 1 and k < wanted * liquid.real(1.0 - 1e-6):
@@ -574,29 +575,42 @@ def _wanted_return_c(liquid: ti.template(), dc, m, water_c):
 
 @ti.func
 @no_type_check
-def _cdu_valve(liquid: ti.template(), c, wanted, most_open):
-    """Return the flow ratio of the facility water of a CDU, and its conductance in W/K."""
+def _no_valve(liquid: ti.template()):
+    """Return the struct of the last valve that has been found, before any of a manifold."""
+    none = liquid.real(-1.0)
+    return ti.Struct(wanted=none, w_per_k=none, valve=none, k=none)
+
+
+@ti.func
+@no_type_check
+def _cdu_valve(liquid: ti.template(), c, wanted, most_open, last: ti.template()):
+    """Return the flow ratio of the facility water of a CDU, and its conductance in W/K.
+
+    They are those of ``last``, a valve of the same manifold, if both CDUs are alike.
+    """
     cdu = liquid.cdus[c]
-    valve, k = liquid.real(0.0), liquid.real(0.0)
-    high = cdu.max_valve * most_open
-    low = ti.min(cdu.min_valve, high)
-    if cdu.w_per_k > 0.0 and high > 0.0:
-        valve, k = flow_for(
-            liquid,
-            wanted,
-            cdu.ua_w_per_k,
-            cdu.wall_share,
-            cdu.side_share,
-            cdu.w_per_k,
-            cdu.w_per_k / cdu.design_w_per_k,
-            cdu.design_w_per_k,
-            low,
-            high,
-        )
-        # At its smallest flow a bypass keeps the coolant from becoming too cold.
-        if valve < low * liquid.real(1.0 + 1e-9):
-            k = ti.min(k, wanted)
-    return valve, k
+    if cdu.alike == 0.0 or wanted != last.wanted or cdu.w_per_k != last.w_per_k:
+        valve, k = liquid.real(0.0), liquid.real(0.0)
+        high = cdu.max_valve * most_open
+        low = ti.min(cdu.min_valve, high)
+        if cdu.w_per_k > 0.0 and high > 0.0:
+            valve, k = flow_for(
+                liquid,
+                wanted,
+                cdu.ua_w_per_k,
+                cdu.wall_share,
+                cdu.side_share,
+                cdu.w_per_k,
+                cdu.w_per_k / cdu.design_w_per_k,
+                cdu.design_w_per_k,
+                low,
+                high,
+            )
+            # At its smallest flow a bypass keeps the coolant from becoming too cold.
+            if valve < low * liquid.real(1.0 + 1e-9):
+                k = ti.min(k, wanted)
+        last.wanted, last.w_per_k, last.valve, last.k = wanted, cdu.w_per_k, valve, k
+    return last.valve, last.k
 
 
 @ti.func
@@ -829,7 +843,7 @@ def _substep(liquid: ti.template(), dc, most_open, dt, part, time_s):
                 _trip(liquid, dc, r, time_s)
                 trips += 1
             r += liquid.one
-        k_sum, c = liquid.real(0.0), liquid.cdu_offsets[m]
+        k_sum, c, last = liquid.real(0.0), liquid.cdu_offsets[m], _no_valve(liquid)
         while c < liquid.cdu_offsets[m + 1]:
             cdu = liquid.cdus[c]
             setpoint_c = ti.max(cdu.setpoint_c, of_dc.least_setpoint_c)
@@ -838,7 +852,7 @@ def _substep(liquid: ti.template(), dc, most_open, dt, part, time_s):
                 * (return_c - setpoint_c)
                 / ti.max(return_c - water_c, liquid.real(1e-9))
             )
-            valve, k = _cdu_valve(liquid, c, ti.max(wanted, 0.0), most_open)
+            valve, k = _cdu_valve(liquid, c, ti.max(wanted, 0.0), most_open, last)
             cdu.k_w_per_k = k
             cdu.valve = cdu.valve + part * valve
             k_sum += k

@@ -59,6 +59,7 @@ CDU_COEFFICIENTS = {
     "max_valve": "largest flow of facility water, as a share of design",
     "pump_w": "power of the pumps at design, in W",
     "fluid_share": "share of the power of the pumps that heats the coolant",
+    "alike": "1 if all CDUs of its manifold have equal constants, else 0",
 }
 """Constants of each CDU."""
 CDU_INPUTS = {

@@ -382,7 +382,7 @@ class Liquid:
 
     def _tower(self, inputs: LiquidInputs) -> TowerResult:
         """Compute the towers for the heat of the last run of the kernel."""
-        _, out = self._rows_out("dc", spec.DC_OUT)
+        out = self._rows_out("dc", spec.DC_OUT)
         share = self._inputs["cooler_share"]
         return yorkcalc(
             out["cooler_w"],
@@ -400,10 +400,12 @@ class Liquid:
             ),
         )
 
-    def _rows_out(self, of: str, rows: Mapping[str, str]) -> tuple[F64, dict[str, F64]]:
-        """Return a copy of results of the kernel, and its rows by name."""
-        copy = self._arrays[f"{of}_out"].copy()
-        return copy, dict(zip(rows, copy, strict=True))
+    def _rows_out(self, of: str, rows: Mapping[str, str], end: str = "") -> dict[str, F64]:
+        """Return a copy of results of the kernel by name, without ``end`` and those behind it."""
+        names = [*rows]
+        names = names[: names.index(end)] if end else names
+        copy = self._arrays[f"{of}_out"][: len(names)].copy()
+        return dict(zip(names, copy, strict=True))
 
     def _after(self, setpoint_c: F64, flow: F64) -> LiquidState:
         """Return the state after a step."""
@@ -412,9 +414,9 @@ class Liquid:
 
     def _result(self, inputs: LiquidInputs) -> LiquidResult:
         """Return the results of a step."""
-        _, dc = self._rows_out("dc", spec.DC_OUT)
-        _, cdu = self._rows_out("cdu", spec.CDU_OUT)
-        _, rack = self._rows_out("rack", spec.RACK_OUT)
+        dc = self._rows_out("dc", spec.DC_OUT)
+        cdu = self._rows_out("cdu", spec.CDU_OUT, end="k_w_per_k")
+        rack = self._rows_out("rack", spec.RACK_OUT, end="runs")
         states = self._arrays["dc_state"].copy()
         fan_w, evaporated_w = dc["cooler_fan_w"], dc["evaporated_w"]
         if self._has_towers:
@@ -601,7 +603,7 @@ class Liquid:
 
     def _cdu_coefficients(self) -> dict[str, Values]:
         p, sizes = self.fleet.cdus, self.sizing
-        return {
+        coefficients: dict[str, Values] = {
             "design_m3s": sizes.cdu_m3s,
             "ua_w_per_k": sizes.cdu_ua_w_per_k,
             "design_w_per_k": sizes.cdu_w_per_k,
@@ -612,6 +614,10 @@ class Liquid:
             "pump_w": sizes.cdu_pump_w,
             "fluid_share": p.fluid_share,
         }
+        loop = self.fleet.cdu_manifold
+        each = np.array([np.broadcast_to(x, self._cdus) for x in coefficients.values()])
+        differs = (each != each[:, self.fleet.cdu_offsets[loop]]).any(axis=0)
+        return coefficients | {"alike": np.bincount(loop, differs, self._loops)[loop] == 0.0}
 
     def _dc_coefficients(self) -> dict[str, Values]:
         p, sizes = self.fleet.plants, self.sizing
