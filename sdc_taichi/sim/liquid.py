@@ -162,6 +162,7 @@ class Liquid:
         loops, racks = len(fleet.rack_offsets) - 1, int(fleet.rack_offsets[-1])
         self._size, self._loops, self._racks = len(fleet.manifold_offsets) - 1, loops, racks
         self._cdus = int(fleet.cdu_offsets[-1])
+        self._cdu_dc = fleet.manifold_dc[fleet.cdu_manifold]
         plants, cdus = fleet.plants, fleet.cdus
         self._dew_margin_k = self._per_dc(plants.dew_margin_k)
         self._approach_k = self._design_approach_k()
@@ -521,8 +522,7 @@ class Liquid:
 
     def _of_cdus(self, values: F64) -> F64:
         """Return the sum of values of the CDUs of each data center, (B,)."""
-        dc = self.fleet.manifold_dc[self.fleet.cdu_manifold]
-        return np.bincount(dc, values, self._size).astype(np.float64)
+        return np.bincount(self._cdu_dc, values, self._size).astype(np.float64)
 
     def _per_dc(self, values: Values) -> F64:
         return np.broadcast_to(values, self._size).astype(np.float64)

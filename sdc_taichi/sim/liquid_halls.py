@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from sdc_taichi.types import (
     CDUS,
     DATA_CENTERS,
     F64,
+    I64,
     QUANTITIES,
     RACKS,
     CduQuantities,
@@ -46,10 +48,9 @@ _ALL_NAMES = (*_NAMES[DATA_CENTERS], *_NAMES[CDUS], *_NAMES[RACKS])
 _TIMES = slice(_NAMES[DATA_CENTERS].index("throttle_s"), _NAMES[DATA_CENTERS].index("trip_s") + 1)
 """Rows of the quantities of data centers that are times."""
 _OF_LOOPS = tuple(f.name for f in (*fields(LoopQuantities), *fields(CduQuantities)))
+_values_of_loops = attrgetter(*_OF_LOOPS)
 _DEVICES = ("cdu_pump", "facility_pump", "cooler_fan", "trim_chiller", "heat_pump")
 """Devices of liquid cooling with electric power."""
-
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass
@@ -66,13 +67,14 @@ class LiquidStep:
     """``LiquidQuantities`` by name."""
     rack_it_w: F64
     """Power of each liquid-cooled rack, in W, (L,)."""
-    server_w: F64
-    """Power of a server of each liquid-cooled rack while it is on, less its heat in the hall's air,
-    in W, (L,)."""
-    tripped: Mask
-    """True for racks that switch off, (R,)."""
-    has_coolant: Mask
-    """True for racks without cold plates, and for those whose coolant can flow, (R,)."""
+    more_rack_w: F64
+    """The same less its heat in the hall's air, in W, (L,)."""
+    on: F64
+    """Share of the step in which each liquid-cooled rack is on, 0..1, (L,)."""
+    tripped: I64
+    """Indices of the racks that switch off."""
+    without_coolant: I64
+    """Indices of the racks with cold plates whose coolant cannot flow or be cooled."""
     throttled_tasks: F64
     """Started work that limited GPUs did not complete, in tasks, (B,)."""
     state: dict[str, F64]
@@ -101,8 +103,10 @@ class LiquidHalls:
             hall,
             fleet.models["thermal"] == "transient",
         )
-        self._racks = fleet.liquid_racks
-        self._dc = fleet.rack_dc[self._racks]
+        self._racks = fleet.liquid_racks.astype(np.intp)
+        self._dc = fleet.rack_dc[self._racks].astype(np.intp)
+        self._cdu_dc = fleet.cdu_dc.astype(np.intp)
+        self._all_on = np.ones(len(self._racks))
         self._model = Liquid(
             fleet.liquid, step_s=3600.0 / fleet.steps_per_hour, transient=self._transient
         )
@@ -151,7 +155,7 @@ class LiquidHalls:
             surroundings: Weather and failures of the step.
             placement: Placement of the work.
         """
-        on = np.ones(len(self._racks))
+        on = self._all_on
         if placement.rack_powered is not None:
             on = placement.rack_powered[self._racks]
         share = None
@@ -182,8 +186,9 @@ class LiquidHalls:
         # Cold lines can take up more than racks give while they have no power.
         result.air_w = np.maximum(result.air_w, 0.0)
         self._hall.set_heat(result.air_w)
-        has_coolant = self._coolant_flows(surroundings, failures)
-        return self._as_step(after, result, on, share, has_coolant)
+        return self._as_step(
+            after, result, on, share, self._racks_without_coolant(surroundings, failures)
+        )
 
     def with_liquid(self, air: HallSums, step: LiquidStep) -> dict[str, Reals]:
         """Return quantities of the halls in which liquid-cooled racks have their whole power."""
@@ -199,8 +204,9 @@ class LiquidHalls:
             per_rack: Number of entries of each rack, (R,).
             step: The step.
         """
-        more_w = np.zeros(self._fleet.racks)
-        more_w[self._racks] = step.server_w
+        more_w, on = np.zeros(self._fleet.racks), step.on
+        while_on_w = np.divide(step.more_rack_w, on, out=np.zeros(len(on)), where=on > 0.0)
+        more_w[self._racks] = while_on_w / self._servers[self._racks]
         power_w += np.repeat(more_w, per_rack.astype(np.int64))
 
     def junction_parts(self, dc: int, rack: int | None) -> JunctionParts:
@@ -225,7 +231,7 @@ class LiquidHalls:
         result: LiquidResult,
         on: F64,
         share: F64 | None,
-        coolant_flows: Mask,
+        without_coolant: I64,
     ) -> LiquidStep:
         """Return a step from the results of the model.
 
@@ -234,52 +240,48 @@ class LiquidHalls:
             result: Results of the model.
             on: Share of the step in which each liquid-cooled rack is on, (L,).
             share: Share of the step that the results of the model describe, (B,); None for all.
-            coolant_flows: Result of ``_coolant_flows``, (L,).
+            without_coolant: Result of ``_racks_without_coolant``.
         """
-        values = {name: getattr(result, name) for name in _OF_LOOPS}
+        size, racks = self._fleet.size, self._fleet.racks
+        values: dict[str, Any] = dict(zip(_OF_LOOPS, _values_of_loops(result), strict=True))
         it_w, liquid_w, lost = result.it_w, result.liquid_w, result.lost_utilisation
         if share is not None:
-            of_axis = {DATA_CENTERS: share, CDUS: share[self._fleet.cdu_dc]}
+            of_axis = {DATA_CENTERS: share, CDUS: share[self._cdu_dc]}
             for name, value in values.items():
                 if name.endswith(("_w", "_l", "_income", "_m3s")) and name != "leak_l":
                     values[name] = value * of_axis[QUANTITIES[name].axis]
             of_racks = share[self._dc]
             it_w, liquid_w, lost = it_w * of_racks, liquid_w * of_racks, lost * of_racks
-        tripped = result.tripped > 0.0
-        # The work of racks that switch off is lost as a whole.
-        lost = np.where(tripped, 0.0, lost) * self._share_of_work
-        throttled = TASKS_PER_STEP * self._sums(lost)
-        of_racks_c, of_racks_w = np.zeros((2, self._fleet.racks))
+        throttled = np.zeros(size)
+        if lost.any():
+            # The work of racks that switch off is lost as a whole.
+            lost = np.where(result.tripped > 0.0, 0.0, lost) * self._share_of_work
+            throttled = TASKS_PER_STEP * self._sums(lost)
+        of_racks_c, of_racks_w = np.zeros((2, racks))
         of_racks_c[self._racks], of_racks_w[self._racks] = result.junction_each_c, liquid_w
-        has_coolant = np.ones(self._fleet.racks, np.bool_)
-        has_coolant[self._racks] = coolant_flows
-        air_w = on * result.air_w
-        while_on_w = np.divide(it_w - air_w, on, out=np.zeros(len(on)), where=on > 0.0)
+        values["throttled_tasks"] = throttled
+        values["rack_junction_c"], values["rack_liquid_w"] = of_racks_c, of_racks_w
+        more_rack_w = it_w - on * result.air_w
         return LiquidStep(
-            more_it_w=self._sums(it_w - air_w),
+            more_it_w=self._sums(more_rack_w),
             overhead_w=sum(values[f"{device}_w"] for device in _DEVICES),
             more_water_l=values["cooler_water_l"] + values["leak_l"],
-            quantities=values
-            | {
-                "throttled_tasks": throttled,
-                "rack_junction_c": of_racks_c,
-                "rack_liquid_w": of_racks_w,
-            },
+            quantities=values,
             rack_it_w=it_w,
-            server_w=while_on_w / self._servers[self._racks],
-            tripped=_of_all(tripped, self._racks, self._fleet.racks),
-            has_coolant=has_coolant,
+            more_rack_w=more_rack_w,
+            on=on,
+            tripped=self._racks[result.tripped > 0.0],
+            without_coolant=without_coolant,
             throttled_tasks=throttled,
             state=self._kept(after),
-            without_room_tasks=np.zeros(self._fleet.size),
+            without_room_tasks=np.zeros(size),
         )
 
     def _kept(self, state: LiquidState) -> dict[str, F64]:
         """Return the fields of ``State``, of which quasi-steady halls need setpoints and flows."""
-        values: dict[str, F64] = fields_of(state)
         if self._transient:
-            return values
-        return no_liquid_state() | {name: values[name] for name in _STEADY_FIELDS}
+            return fields_of(state)
+        return no_liquid_state() | {name: getattr(state, name) for name in _STEADY_FIELDS}
 
     def _sums(self, of_racks: F64) -> F64:
         """Sum values of liquid-cooled racks, (L,), within each data center, (B,)."""
@@ -303,7 +305,7 @@ class LiquidHalls:
         on = (surroundings.powered > 0.0).astype(np.float64)
         ones = np.ones(size)
         up = np.ones(fleet.cdus) if surroundings.cdu_up is None else surroundings.cdu_up
-        failures["cdu_up"] = up * on[fleet.cdu_dc]
+        failures["cdu_up"] = up * on[self._cdu_dc]
         pump = ones if surroundings.facility_pump is None else surroundings.facility_pump
         failures["facility_pump"] = pump * on
         fans = ones if surroundings.cooler_share is None else surroundings.cooler_share
@@ -314,20 +316,20 @@ class LiquidHalls:
             failures["rack_valve"] = np.where(surroundings.rack_leaks, 0.0, 1.0)
         return failures
 
-    def _coolant_flows(self, surroundings: Surroundings, failures: dict[str, Any]) -> Mask:
-        """Return True for racks that need no coolant, or whose coolant flows and is cooled, (L,).
+    def _racks_without_coolant(self, surroundings: Surroundings, failures: dict[str, Any]) -> I64:
+        """Return indices of racks with cold plates whose coolant cannot flow or be cooled.
 
         Racks with a rear door run on in air.
         """
         if surroundings.cdu_up is None:
-            return np.ones(len(self._racks), np.bool_)
+            return self._racks[:0]
         assert surroundings.facility_pump is not None
         assert surroundings.rack_leaks is not None
         pumping = failures["cdu_up"] * failures.get("cdu_pumps", 1.0)
         per_manifold = np.bincount(self._cdu_manifold, pumping, self._manifolds)
         has_water = failures["facility_pump"][self._dc] > 0.0
         flows = (per_manifold[self._manifold] > 0.0) & has_water & ~surroundings.rack_leaks
-        return np.asarray(flows | ~self._model.fleet.has_plates)
+        return np.asarray(self._racks[~flows & self._model.fleet.has_plates])
 
 
 def with_leaks(state: State, surroundings: Surroundings, fleet: Fleet) -> State:
@@ -357,10 +359,3 @@ def without_liquid(fleet: Fleet) -> dict[str, Any]:
 def no_liquid_state() -> dict[str, F64]:
     """Return the fields of ``State`` that liquid cooling needs, empty, by name."""
     return _NO_STATE
-
-
-def _of_all(chosen: Mask, racks: npt.NDArray[np.integer], count: int) -> Mask:
-    """Return a mask of all racks from that of the racks at some indices."""
-    mask = np.zeros(count, np.bool_)
-    mask[racks] = chosen
-    return mask

@@ -117,6 +117,7 @@ LIQUID_COMMANDS: dict[str, tuple[str, tuple[float, float]]] = {
 of ``Actions``."""
 _HELD_LIQUID: dict[str, F64 | None] = {name: None for name, _ in LIQUID_COMMANDS.values()}
 _liquid_actions = attrgetter(*LIQUID_COMMANDS)
+_NEUTRAL = Actions()
 
 
 class ActionDecoder:
@@ -146,7 +147,7 @@ class ActionDecoder:
         """
         if actions is not None and not isinstance(actions, Actions):
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
-        wanted = actions or Actions()
+        wanted = _NEUTRAL if actions is None else actions
         load_command = self._command("load", wanted.load, LoadAction, limit=1.0)
         battery_command = self._command("battery", wanted.battery, BatteryAction, limit=1.0)
         cooling = CoolAction.HOLD if wanted.cooling is None else wanted.cooling

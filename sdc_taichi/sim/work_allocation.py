@@ -62,8 +62,8 @@ class RackOutcome(RackQuantities):
 class LiquidOutcome(Protocol):
     """Effects of liquid cooling on R racks and the work of B data centers, see ``LiquidStep``."""
 
-    tripped: Mask
-    has_coolant: Mask
+    tripped: I64
+    without_coolant: I64
     throttled_tasks: F64
     without_room_tasks: F64
 
@@ -101,6 +101,8 @@ class WorkAllocation:
             "outlet_trip_c": outlet_trip_c,
         }
         self._limits = {name: each[fleet.rack_dc] + LEAST_EXCESS_K for name, each in limits.items()}
+        names = ("limit_c", "trip_c"), ("outlet_limit_c", "outlet_trip_c")
+        self._inlet_c, self._outlet_c = (min(self._limits[x].min() for x in of) for of in names)
         self._step_min = 60.0 / fleet.steps_per_hour
         restart_c = fleet.values("protection.restart_c")
         midway_c = 0.5 * (RECOMMENDED_C[1] + limit_c)
@@ -205,31 +207,14 @@ class WorkAllocation:
             liquid: Effects of liquid cooling on racks and work; None for fleets without it.
         """
         lost_share = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
-        before, status = state.rack_status, state.rack_status.copy()
-        wait_min = state.restart_wait_min
+        status, wait_min = state.rack_status.copy(), state.restart_wait_min
         if self._protected:
-            inlet_max_c = air.rack_inlet_max_c.astype(np.float64)
-            fans_failed = np.zeros(len(before), np.bool_)
-            if surroundings.rack_airflow is not None:
-                fans_failed = surroundings.rack_airflow < 1.0
-            restarts = np.zeros(len(before), np.bool_)
-            if (before == TRIPPED).any():
-                cooled = self._is_cooled(surroundings, plant)[self._fleet.rack_dc] & ~fans_failed
-                if liquid is not None:
-                    cooled &= liquid.has_coolant
-                restarts, wait_min = self._restart(before, wait_min, inlet_max_c, cooled)
-            status = protection.protect(
-                before,
-                inlet_max_c,
-                air.rack_outlet_max_c.astype(np.float64),
-                **self._limits,
-                throttle_share=self._throttle_share,
-                fans_failed=fans_failed,
-                restarts=restarts,
-            )
+            if status.any() or self._may_be_hot(air):
+                status, wait_min = self._by_temperature(state, surroundings, air, plant, liquid)
             if liquid is not None:
                 status[liquid.tripped] = TRIPPED
-            lost_share = lost_share + self._tripped_work(before, status, placement)
+            if status.any():
+                lost_share = lost_share + self._tripped_work(state.rack_status, status, placement)
         lost_tasks = TASKS_PER_STEP * lost_share
         executed_tasks = work.started_tasks - lost_tasks
         if liquid is not None:
@@ -243,6 +228,46 @@ class WorkAllocation:
             lost_tasks=lost_tasks,
             executed_tasks=executed_tasks,
         )
+
+    def _may_be_hot(self, air: HallSums) -> bool:
+        """Return False if no rack is warmer than the lowest of all limits."""
+        inlet_c = float(np.maximum.reduce(air.rack_inlet_max_c))
+        outlet_c = float(np.maximum.reduce(air.rack_outlet_max_c))
+        return not (inlet_c <= self._inlet_c and outlet_c <= self._outlet_c)
+
+    def _by_temperature(
+        self,
+        state: State,
+        surroundings: Surroundings,
+        air: HallSums,
+        plant: Mapping[str, Any],
+        liquid: LiquidOutcome | None,
+    ) -> tuple[Status, F64]:
+        """Return the status of each rack by its hottest inlet and outlet, and ``restart_wait_min``.
+
+        Arguments are those of ``protect``; the results have the shape (R,).
+        """
+        before, wait_min = state.rack_status, state.restart_wait_min
+        inlet_max_c = air.rack_inlet_max_c.astype(np.float64)
+        fans_failed = np.zeros(len(before), np.bool_)
+        if surroundings.rack_airflow is not None:
+            fans_failed = surroundings.rack_airflow < 1.0
+        restarts = np.zeros(len(before), np.bool_)
+        if (before == TRIPPED).any():
+            cooled = self._is_cooled(surroundings, plant)[self._fleet.rack_dc] & ~fans_failed
+            if liquid is not None:
+                cooled[liquid.without_coolant] = False
+            restarts, wait_min = self._restart(before, wait_min, inlet_max_c, cooled)
+        status = protection.protect(
+            before,
+            inlet_max_c,
+            air.rack_outlet_max_c.astype(np.float64),
+            **self._limits,
+            throttle_share=self._throttle_share,
+            fans_failed=fans_failed,
+            restarts=restarts,
+        )
+        return status, wait_min
 
     def _restart(
         self, before: Status, wait_min: F64, inlet_max_c: F64, cooled: Mask

@@ -297,6 +297,8 @@ class Workload:
             Work of the step with the queues after that, and work that finds no room, in tasks,
             (B,).
         """
+        if not tasks.any():
+            return work, tasks
         room = np.maximum(self._queue_limit - work.queue_tasks, 0.0)
         back = np.minimum(tasks, room)
         if not back.any():
