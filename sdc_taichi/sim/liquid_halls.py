@@ -68,7 +68,7 @@ class LiquidStep:
     rack_it_w: F64
     """Power of each liquid-cooled rack, in W, (L,)."""
     more_rack_w: F64
-    """The same less its heat in the hall's air, in W, (L,)."""
+    """Power of each liquid-cooled rack less its heat in the hall's air, in W, (L,)."""
     on: F64
     """Share of the step in which each liquid-cooled rack is on, 0..1, (L,)."""
     tripped: I64
