@@ -117,9 +117,8 @@ class MixWeights:
         """Return the n source racks of one rack, (n,), and their weights, which sum to 1, (n,)."""
         runs = slice(self.run_offsets[rack], self.run_offsets[rack + 1])
         lengths = self.run_length[runs]
-        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        sources = np.repeat(self.run_first_rack[runs], lengths) + within
-        weights = self.weights[np.repeat(self.run_first_weight[runs], lengths) + within]
+        _, sources = items_of_ranges(self.run_first_rack[runs], lengths)
+        weights = self.weights[items_of_ranges(self.run_first_weight[runs], lengths)[1]]
         return sources, np.asarray(weights * self.strength[sources] * self.norm[rack])
 
     def _slices(self) -> Iterator[tuple[Any, Any, F64]]:
@@ -136,6 +135,21 @@ class MixWeights:
 
 _Runs = tuple[I32, I32, I32, I32]
 """Tuple of ``run_offsets``, ``run_first_rack``, ``run_length`` and ``run_first_weight``."""
+
+
+def items_of_ranges(first: I32 | I64, lengths: I32 | I64) -> tuple[I64, I64]:
+    """Return the items of n ranges of whole numbers, one range after another.
+
+    Args:
+        first: First item of each range, (n,).
+        lengths: Number of items of each range, (n,).
+
+    Returns:
+        Index of the range of each item, and the items, (sum of the lengths,) each.
+    """
+    of_range = np.repeat(np.arange(len(lengths)), lengths)
+    before = np.cumsum(lengths, dtype=np.int64) - lengths
+    return of_range, np.arange(len(of_range)) + (first - before)[of_range]
 
 
 def layout_weights(hall: HallConfig, airflow_m3s: F64 | None = None) -> MixWeights:

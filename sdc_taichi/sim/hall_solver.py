@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from sdc_taichi.errors import PhysicalLimitError, RuntimeStateError, SdcError
 from sdc_taichi.hall.initial_guess import TABLE_LOADS, USUAL_GAIN
+from sdc_taichi.hall.mix_weights import items_of_ranges
 from sdc_taichi.hall.steady_modes import SteadyModes, extended_modes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.compiler import runtime
@@ -52,7 +53,7 @@ from sdc_taichi.sim.sampled_halls import (
     sparse_halls,
     supply_range_c,
 )
-from sdc_taichi.types import F64, I32, I64, HallQuantities, Reals, ServerLayers
+from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
 
 _FIRST_CONTROL = [
     np.array(
@@ -359,14 +360,16 @@ class Hall:
         """
         fleet, arrays = self._fleet, self._tables.arrays
         first, counts = fleet.group_offsets[racks], np.diff(fleet.group_offsets)[racks]
-        in_rack, groups = _each(first, counts)
+        in_rack, groups = items_of_ranges(first, counts)
         rows = np.concatenate(fleet.group_rows, axis=1)[:, groups]
         count, full_w = (rows[row_index(GROUP_INPUTS, name)] for name in ("count", "full_w"))
         of_rack_w = np.bincount(in_rack, count * full_w)
         self._heat_share = full_w[np.cumsum(counts) - counts] / of_rack_w
         self._heat_places = self._places.of_racks[racks]
         block, of_blocks = self._heat_places // LANES, self._tables.rows("block_ints")
-        in_rack, entries = _each(of_blocks["first_row"][block], of_blocks["groups"][block])
+        in_rack, entries = items_of_ranges(
+            of_blocks["first_row"][block], of_blocks["groups"][block]
+        )
         inputs = arrays["group_inputs"].reshape(-1, len(GROUP_INPUTS), LANES)
         places = self._heat_places[in_rack]
         full, idle = (row_index(GROUP_INPUTS, name) for name in ("full_w", "idle_w"))
@@ -1122,16 +1125,6 @@ def _group_parts(fleet: Fleet) -> F64:
     count, full = (row_index(GROUP_INPUTS, name) for name in ("count", "full_airflow"))
     airflow = np.concatenate([rows[count] * rows[full] for rows in fleet.group_rows])
     return airflow / np.repeat(fleet.group_sums(airflow), np.diff(fleet.group_offsets))
-
-
-def _each(first: I32, counts: I32) -> tuple[I64, I64]:
-    """Return the items of ranges, given by their first items and lengths, one after another.
-
-    Returns:
-        Index of the range of each item, and the items.
-    """
-    of_range = np.repeat(np.arange(len(counts)), counts)
-    return of_range, np.arange(len(of_range)) + (first - (np.cumsum(counts) - counts))[of_range]
 
 
 def _condition_shapes(fleet: Fleet) -> dict[str, tuple[int]]:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.hall.initial_guess import SteadyStateTable
-from sdc_taichi.hall.mix_weights import DENSE_RACKS
+from sdc_taichi.hall.mix_weights import DENSE_RACKS, items_of_ranges
 from sdc_taichi.hall.steady_modes import SteadyModes
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.hall_arguments import (
@@ -220,11 +220,10 @@ def _build_places(fleet: Fleet) -> RackPlaces:
         # Exhausts are read as vectors of SPARSE_LANES, so halls must begin at such a vector.
         blocks = -(-blocks // SPARSE_BLOCKS) * SPARSE_BLOCKS
     block_offsets = offsets_from_counts(blocks, "blocks of racks")
-    within = np.arange(fleet.racks) - np.repeat(fleet.rack_offsets[:-1], racks)
     return RackPlaces(
         blocks=blocks,
         block_offsets=block_offsets,
-        of_racks=LANES * np.repeat(block_offsets[:-1], racks) + within,
+        of_racks=items_of_ranges(LANES * block_offsets[:-1], racks)[1],
         racks_per_dc=int(racks[0]) if np.all(racks == racks[0]) else None,
     )
 
@@ -595,13 +594,12 @@ def _build_sources(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> di
     # Vector 0 is that of a rack without weights.
     first_vector = 1 + offsets_from_counts(n_vectors[one], "vectors of weights").astype(np.int64)
     of_rack = np.zeros((int(first_vector[-1]), SPARSE_LANES))
-    within = _positions(length[one])
-    to = np.repeat(first_vector[:-1] * SPARSE_LANES + lane[one], length[one]) + within
-    of_rack.reshape(-1)[to] = mix_weights.weights[np.repeat(offset[one], length[one]) + within]
+    _, to = items_of_ranges(first_vector[:-1] * SPARSE_LANES + lane[one], length[one])
+    _, weight_at = items_of_ranges(offset[one], length[one])
+    of_rack.reshape(-1)[to] = mix_weights.weights[weight_at]
     # Vectors of the racks of a block that have the same sources.
-    within = _positions(n_vectors)
-    place = np.repeat(np.repeat(places.of_racks, counts)[of_sparse], n_vectors)
-    source = np.repeat(first // SPARSE_LANES, n_vectors) + within
+    of_run, source = items_of_ranges(first // SPARSE_LANES, n_vectors)
+    place = np.repeat(places.of_racks, counts)[of_sparse][of_run]
     # Neighbouring runs of a rack may share a vector, which then has two entries.
     at = np.arange(len(place))
     follows = np.zeros(len(place), np.bool_)
@@ -612,7 +610,8 @@ def _build_sources(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> di
     entries, entry = np.unique(entry, return_inverse=True)
     block, source = np.divmod(entries // copies, n_blocks)
     of_lane = np.zeros((len(entries), LANES), np.int64)
-    of_lane[entry, place % LANES] = np.repeat(first_vector[:-1][same], n_vectors) + within
+    _, vector_at = items_of_ranges(first_vector[:-1][same], n_vectors)
+    of_lane[entry, place % LANES] = vector_at
     # Entries with equal weights share them.
     shared = np.zeros(len(entries), np.int64)
     for vector in of_lane.T:
@@ -627,11 +626,6 @@ def _build_sources(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> di
         "source_ints": _index_rows(SOURCE_INTS, {"vector": source, "weights": shared}),
         "sparse_weights": weights,
     }
-
-
-def _positions(counts: Array) -> Array:
-    """Return the position of each item within its group, for groups of ``counts`` items."""
-    return np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> Array:
