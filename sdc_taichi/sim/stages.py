@@ -245,12 +245,13 @@ class SteadyFacility:
             self._air,
             self._liquid,
         )
-        throttles = self._liquid is not None and self._liquid.throttled_tasks > 0.0
         possible = (results["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
+        if self._liquid is not None:
+            possible &= self._liquid.throttled_tasks <= 0.0
         return SteadyStep(
             facility_kwh=results["it_kwh"] + results["overhead_w"] * self._step_h / 1e3,
             water_l=results["water_l"],
-            unmet_w=np.where(possible & ~throttles, results["unmet_w"], np.inf),
+            unmet_w=np.where(possible, results["unmet_w"], np.inf),
         )
 
     def close(self) -> None:
