@@ -133,7 +133,8 @@ def test_what_is_closed_and_kept_holds_next_to_nothing(kind: str, tmp_path: Path
         kept = [closed() for _ in range(4)]
         with_kept, _ = tracemalloc.get_traced_memory()
         count = len(kept)
-        # What dropping them frees: other memory in use includes Python's lists of free objects.
+        # Python keeps the memory of some freed objects for later ones, and tracemalloc counts it.
+        # The bytes that become free with the environments do not include it.
         kept.clear()
         without, _ = tracemalloc.get_traced_memory()
     finally:

@@ -8,8 +8,8 @@ from sdc_taichi.benchmark.rules_search import COOLING, best_rules
 
 
 def figures(best: dict[str, str], asked: list[str]) -> Callable[[str], float]:
-    """A figure that falls by 1 for each agent with its best rule, and by 1 for work and battery
-    together."""
+    """Return a figure that falls by 1 for each agent with its best rule, and by 1 more if work and
+    battery both have theirs."""
 
     def figure(spec: str) -> float:
         asked.append(spec)

@@ -21,7 +21,7 @@ from sdc_taichi.control.rules import setpoint_command
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.optimum.loop_map import LOOP_COMMANDS
+from sdc_taichi.optimum.loop_map import LOOP_COMMANDS, LoopCommands
 from sdc_taichi.optimum.objective import CARBON, Objective
 from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.plant.workload import TASKS_PER_STEP
@@ -31,7 +31,6 @@ from sdc_taichi.types import F64, I64, Actions
 
 if TYPE_CHECKING:
     from sdc_taichi.control.plans import EnergyCost, QueuePlan, StorePlanner, Weather
-    from sdc_taichi.optimum.loop_map import LoopCommands
 
 LOOP_STEP_K = 0.5
 """Spacing of the candidate supply setpoints of CDUs, in K."""
@@ -183,7 +182,6 @@ class _Planners:
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.plans import QueuePlanner, StorePlanner
         from sdc_taichi.optimum.facility_map import facility_map
-        from sdc_taichi.optimum.loop_map import LoopCommands
         from sdc_taichi.optimum.problem import inlet_limits_c, require_traces
 
         require_traces(view.fleet)

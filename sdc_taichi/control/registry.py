@@ -43,7 +43,7 @@ from sdc_taichi.errors import (
 )
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.optimum.objective import CARBON, Objective
-from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent
+from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent, movable_agents
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import check_code, import_path, imported, register_function
 
@@ -108,8 +108,8 @@ def controller_names() -> tuple[str, ...]:
     ``follow`` and other rules for CRAC units take temperatures, see ``control.hall_rules``.
     ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``rank-24h`` for any
     window, share and objective, such as ``rank-12h:0.3:cost``; ``mpc-24h`` for any horizon and
-    objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a
-    training run or a policy. An import path ``module:name`` is also valid.
+    objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a training run or a
+    policy. An import path ``module:name`` is also valid.
     """
     added = (name for name in _registered if name not in _BUILT_IN)
     return (*_CONTROLLERS, *HALL_RULES, RULES, _CONSTANT, _RANK, _MPC, _POLICY, *added)
@@ -255,8 +255,7 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
     if is_mpc(name):
         if "liquid" in (parts or ()):
             require_liquid(name, fleet)
-        known = ALL_AGENTS if fleet.cdus else AGENTS
-        agents = tuple(a for a in known if parts is None or a in parts)
+        agents = tuple(a for a in movable_agents(fleet) if parts is None or a in parts)
         entry = _NamedController(lambda: model_predictive(name, agents), ALL_AGENTS)
     elif name.startswith("rank-"):
         commands = tuple(a for a in ("load", "battery") if parts is None or a in parts)

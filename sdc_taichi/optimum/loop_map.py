@@ -226,7 +226,9 @@ class LoopCommands:
         racks, trials = int(loops.rack_offsets[-1]), CommandedLoops(loops, _TRIED)
         offsets = np.random.default_rng(0).uniform(-1.0, 1.0, (_ROUNDS, 3, _TRIED))
         offsets[:, :, 0] = 0.0
-        dew_point_c = self._dew_points_c[dc](outdoor_c, wet_bulb_c)
+        dew_point_c = np.broadcast_to(
+            self._dew_points_c[dc](outdoor_c, wet_bulb_c), outdoor_c.shape
+        )
         excess_w = np.zeros(len(outdoor_c))
         for k, centre in enumerate(self.of(dc).at(outdoor_c, wet_bulb_c, utilisation).T):
             conditions = LoopConditions(
@@ -234,7 +236,7 @@ class LoopCommands:
                 np.ones(racks),
                 float(outdoor_c[k]),
                 float(wet_bulb_c[k]),
-                float(np.broadcast_to(dew_point_c, len(excess_w))[k]),
+                float(dew_point_c[k]),
             )
             costs_w = []
             for i, each in enumerate(offsets):

@@ -71,7 +71,8 @@ def path_of(
     Raises:
         ConfigError: No plan satisfies the limits.
     """
-    problem, plans = problem.moving(agents), dict[Agent, F64]()
+    problem = problem.moving(agents)
+    plans: dict[Agent, F64] = {}
     if "load" in agents:
         plans["load"] = plan(problem, check=check).executed_tasks
     for agent in agents:

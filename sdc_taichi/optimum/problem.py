@@ -200,6 +200,11 @@ class Problem:
         return replace(self, agents=agents, table=self.held, held=None)
 
 
+def movable_agents(fleet: Fleet) -> tuple[Agent, ...]:
+    """Return the agents that a plan may control in a fleet."""
+    return ALL_AGENTS if fleet.cdus else AGENTS
+
+
 def require_traces(fleet: Fleet) -> None:
     """Check that the arriving work of every data center is that of a trace, which plans need.
 
@@ -530,8 +535,9 @@ def loops_reason(problem: Problem, config: DataCenterConfig) -> str | None:
     if problem.litre_weight > 0:
         return "the tables of coolant loops hold the commands of least energy, not of least water"
     if config.workload.placement != "uniform":
-        return "the tables of coolant loops are of equal loads on all racks, not of placement " + (
-            config.workload.placement
+        return (
+            "the tables of coolant loops are of equal loads on all racks, not of placement "
+            f"{config.workload.placement}"
         )
     if np.isinf(problem.loops_error):
         return "commands of the tables of coolant loops throttle GPUs, and others do not"

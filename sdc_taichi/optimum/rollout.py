@@ -144,14 +144,15 @@ def roll_out(
         follower = Follower(fleet, sim.drivers, sim.sizing, targets)
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
+        lag_k = done.pop("loops_lag_k")
         for t in range(steps):
             result: StepResult = sim.step(follower.actions(sim.state))
             score.add(result)
-            for name in done.keys() - {"loops_lag_k"}:
-                done[name][t] = getattr(result, name)
-            done["loops_lag_k"][t] = follower.loops_lag_k(sim.state)
+            for name, values in done.items():
+                values[t] = getattr(result, name)
+            lag_k[t] = follower.loops_lag_k(sim.state)
             on_step()
-    return RollOut(**done), score
+    return RollOut(**done, loops_lag_k=lag_k), score
 
 
 class Follower:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.cache import key_of
 from sdc_taichi.optimum.loop_map import SAMPLES, LoopCommands
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS, Agent, Problem, problems_of
+from sdc_taichi.optimum.problem import Agent, Problem, movable_agents, problems_of
 from sdc_taichi.optimum.tables import (
     UTILISATIONS,
     OnStep,
@@ -130,40 +131,37 @@ class Task:
         Args:
             on_step: Progress callback ``(done, total)`` of the tables.
         """
-        kinds: list[LoopCommands | None] = [None]
-        if "liquid" in self.agents:
-            kinds.append(LoopCommands(self.fleet, self.drivers))
-        held, *moved = (
-            facility_tables(
-                self.fleet,
-                self.drivers,
-                start=self.start,
-                steps=self.steps,
-                precision=self.precision,
-                loops=loops,
-                on_step=on_step,
-            )
-            for loops in kinds
+        tables_with = partial(
+            facility_tables,
+            self.fleet,
+            self.drivers,
+            start=self.start,
+            steps=self.steps,
+            precision=self.precision,
+            on_step=on_step,
         )
+        tables, held, loops = tables_with(loops=None), None, None
+        if "liquid" in self.agents:
+            loops = LoopCommands(self.fleet, self.drivers)
+            tables, held = tables_with(loops=loops), tables
         with Simulator(self.fleet, drivers=self.drivers, precision=self.precision) as sim:
             problems = problems_of(
                 self.fleet,
                 self.drivers,
                 sim.sizing,
-                moved[0] if moved else held,
+                tables,
                 start=self.start,
                 objective=self.objective,
                 agents=self.agents,
                 scored_from=self.scored_from,
                 inlet_limit_c=self.inlet_limit_c,
-                held=held if moved else None,
+                held=held,
             )
-        if kinds[-1] is None:
+        if loops is None:
             return problems
-        errors = (self._loops_error(dc, kinds[-1], each) for dc, each in enumerate(problems))
         return [
-            replace(problem, loops_error=error)
-            for problem, error in zip(problems, errors, strict=True)
+            replace(problem, loops_error=self._loops_error(dc, loops, problem))
+            for dc, problem in enumerate(problems)
         ]
 
     def _loops_error(self, dc: int, loops: LoopCommands, problem: Problem) -> float:
@@ -225,7 +223,7 @@ def checked_agents(agents: Sequence[Agent] | None, fleet: Fleet) -> tuple[Agent,
         ConfigError: there is no name, or a name is unknown or repeated, or no data center has
             coolant loops.
     """
-    known = ALL_AGENTS if fleet.cdus else AGENTS
+    known = movable_agents(fleet)
     if agents is None:
         return known
     named = (agents,) if isinstance(agents, str) else tuple(agents)

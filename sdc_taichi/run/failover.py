@@ -401,9 +401,8 @@ def failover_rows(study: Failover, order: Sequence[int]) -> list[dict[str, Any]]
     is_liquid, first = study.lost == "liquid", SHOWN_AFTER_MIN[0]
     times = {"throttle": study.throttle_min, "trip": study.trip_min}
     unit, per_min = ("s", 60.0) if is_liquid else ("min", 1.0)
-    place, water = "junction" if study.of_junctions else "inlet", "chilled_water"
-    if is_liquid:
-        water = "coolant"
+    place = "junction" if study.of_junctions else "inlet"
+    water = "coolant" if is_liquid else "chilled_water"
     return [
         {
             "lost": study.losses[i].name,
