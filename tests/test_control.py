@@ -40,7 +40,7 @@ from sdc_taichi.control import (
     view_maker,
 )
 from sdc_taichi.control.hall_rules import HALL_RULES
-from sdc_taichi.control.registry import RULES, RULES_SPEC
+from sdc_taichi.control.registry import RULE_OF_AGENT, RULES
 from sdc_taichi.control.rules import FixedSetpoint, rank_command, slots_in_step
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.learning.interface import interface_of
@@ -254,9 +254,14 @@ def test_rules_stand_for_a_rule_for_each_agent() -> None:
     with Simulator(load_config("tiny")) as sim:
         sim.reset()
         view = view_maker(sim)(None)
-        acts = [make_controller(name, sim.fleet).act(view) for name in (RULES, RULES_SPEC)]
+        spec = ",".join(f"{agent}={name}" for agent, name in RULE_OF_AGENT.items())
+        acts = [make_controller(name, sim.fleet).act(view) for name in (RULES, spec)]
+        alone = make_controller("load=rules", sim.fleet).act(view)
+        with pytest.raises(ConfigError, match="'rules': does not act on geo; valid for geo"):
+            make_controller("geo=rules", sim.fleet)
     assert acts[0] == acts[1]
     assert {*parts_of(RULES)} == {"load", "cooling", "battery"}
+    assert alone == Actions(load=acts[0].load)
 
 
 def test_greedy_follows_the_mean_of_the_coming_day() -> None:

@@ -86,8 +86,8 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "geo-mpc": _NamedController(lambda: _fleet_predictive(), ("load", "cooling", "geo")),
 }
 RULES = "rules"
-"""Name that stands for ``RULES_SPEC``."""
-RULES_SPEC = "load=rank-48h:0.3,cooling=constant:21,battery=rank-12h:0.2"
+"""Name that stands for ``RULE_OF_AGENT``, or in a spec for the rule of its agent."""
+RULE_OF_AGENT = {"load": "rank-48h:0.3", "cooling": "constant:21", "battery": "rank-12h:0.2"}
 """A rule for each agent: what ``benchmark.rules_search`` finds for carbon in the validation weeks
 of suite ``carbon``, with the best setpoint that every preset allows."""
 _CONSTANT = "constant:C"
@@ -183,7 +183,7 @@ def parts_of(spec: str) -> dict[str, str]:
         ConfigError: An agent is unknown or appears twice.
     """
     if spec.strip() == RULES:
-        spec = RULES_SPEC
+        return dict(RULE_OF_AGENT)
     first, sign, _ = spec.partition("=")
     if not sign or ":" in first:
         return {}
@@ -197,7 +197,7 @@ def parts_of(spec: str) -> dict[str, str]:
             )
         if agent in named:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice; valid is each once")
-        named[agent] = name
+        named[agent] = RULE_OF_AGENT.get(agent, name) if name == RULES else name
     return named
 
 
@@ -257,6 +257,9 @@ def _make(name: str, fleet: Fleet, parts: tuple[str, ...] | None, allow_code: bo
             require_liquid(name, fleet)
         agents = tuple(a for a in movable_agents(fleet) if parts is None or a in parts)
         entry = _NamedController(lambda: model_predictive(name, agents), ALL_AGENTS)
+    elif name == RULES:
+        # Specs have the rules of their agents by now, so the agent is one without a rule.
+        entry = _NamedController(Idle, tuple(RULE_OF_AGENT))
     elif name.startswith("rank-"):
         commands = tuple(a for a in ("load", "battery") if parts is None or a in parts)
         entry = _NamedController(lambda: _rank(name, commands), ("load", "battery"))
