@@ -23,6 +23,7 @@ from published import (
 from sdc_taichi import make_controller
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.store import ResultStore
+from sdc_taichi.benchmark.suite import Case, Row
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
 
 pytestmark = pytest.mark.repo
@@ -34,14 +35,17 @@ SHARES = "small"
 
 @pytest.mark.parametrize("suite", sorted(path.name for path in FOLDER.iterdir()))
 def test_suites_are_still_those_that_were_published(suite: str) -> None:
+    if suite in WAITING:
+        pytest.skip(f"suite {suite} waits to be published again: it may be defined anew")
     published, now = described(suite), suite_of(suite)
     assert str(now.objective) == published["objective"]
-    case = now.cases[published["case"]].model_dump(mode="json", exclude={"about"})
-    assert case == published["case_settings"]
-    leave_out = {"about", "seeds", "cases"}
-    rows = {name: now.rows[name].model_dump(mode="json", exclude=leave_out)
-            for name in published["row_settings"]}  # fmt: skip
-    assert rows == published["row_settings"]
+    # Fields that were added since have their defaults, and those that were removed had none.
+    case = now.cases[published["case"]].model_copy(update={"about": ""})
+    assert case == Case.model_validate(published["case_settings"])
+    leave_out = {"about": "", "seeds": None, "cases": None}
+    for name, values in published["row_settings"].items():
+        row = Row.model_validate({key: value for key, value in values.items() if value})
+        assert now.rows[name].model_copy(update=leave_out) == row
 
 
 @pytest.mark.parametrize("suite", ["small", *SUITES])
