@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from policies import interface, network
 from sdc_taichi import ConfigError
-from sdc_taichi.benchmark.cases import check_suite, data_centers
+from sdc_taichi.benchmark.cases import check_suite, data_centers, training_settings
 from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import Inputs, Job
 from sdc_taichi.benchmark.store import ResultStore
@@ -24,6 +24,7 @@ from sdc_taichi.benchmark.suite import (
 )
 from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs, run_suite, study_of
 from sdc_taichi.cli.app import app
+from sdc_taichi.control import ForecastError
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.policy import About, Policy
 from sdc_taichi.optimum.problem import AGENTS
@@ -113,6 +114,8 @@ def test_another_input_file_in_a_place_makes_other_jobs(tmp_path: Path) -> None:
             "best_of: g36, idle, g36; valid is each once",
         ),
         ({"objective": "carbn"}, "did you mean 'carbon'"),
+        (case(rows=["idel"]), "cases.tiny.rows: no row 'idel'"),
+        (case(forecast_error="ci=x"), "forecast_error"),
         (case(weeks=[1]), "week 1 stands in weeks too, by which nothing may be chosen"),
         (case(config="tinny"), "no such file or preset; did you mean 'tiny'"),
         (case(optimum=False), "rows.optimum: case tiny has optimum false"),
@@ -209,6 +212,24 @@ def test_the_test_may_be_of_other_data_centers() -> None:
     assert [dc.site.location for dc in held_out] == ["TX"]
     assert [dc.site.location for dc in validation] == ["NY", "CA"]
     assert (held_out[0].site.seed, validation[0].site.seed) == (3, 10)
+
+
+def test_errors_of_forecasts_are_those_of_a_case_and_share_its_optima() -> None:
+    tiny = SMALL["cases"]["tiny"]
+    noisy = {**tiny, "forecast_error": "ci=0.1,temperature=1", "rows": ["idle", "ippo", "bound"]}
+    suite = small(cases={"tiny": tiny, "noisy": noisy})
+    settings = training_settings(
+        suite.cases["noisy"], suite.rows["ippo"], objective="carbon", seed=0, training={}
+    )
+    assert settings.environment.forecast_error == ForecastError(0.1, 1.0)
+    references = reference_jobs(suite)
+    assert {job.partition["case"] for job in references} == {"tiny"}
+    jobs = row_jobs(suite, references)
+    of_noisy = [job for job in jobs if job.partition["case"] == "noisy"]
+    assert [job.partition["row"] for job in of_noisy] == ["idle"] * 2 + ["ippo"] * 2 + ["bound"]
+    assert of_noisy[-1].inputs == next(x for x in jobs if x.name == "small/tiny/bound/0").inputs
+    alone = suite.chosen(cases=["noisy"], rows=["bound"])
+    assert {job.partition["case"] for job in reference_jobs(alone)} == {"noisy"}
 
 
 def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> None:

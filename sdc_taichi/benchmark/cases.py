@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from sdc_taichi.benchmark.suite import Case, Part, Row, Suite
@@ -77,7 +78,7 @@ def training_settings(
     for name in _FIXED:
         if name in settings:
             raise ConfigError(f"train: {name}: is that of the case; valid is without")
-    of_case = {
+    of_case: dict[str, Any] = {
         "weeks": case.training_weeks,
         "seed": seed,
         "tensorboard": False,
@@ -88,6 +89,8 @@ def training_settings(
             "optimum": case.optimum,
         },
     }
+    if case.forecast_error is not None:
+        of_case["environment"] = {"forecast_error": asdict(case.error)}
     values = merged(merged(_data_center_values(case), of_case), settings)
     if agent is not None:
         values = merged(values, {"environment": {"agents": [agent], "others": "idle"}})
@@ -118,6 +121,8 @@ def agents_of(settings: TrainingSettings) -> tuple[str, ...]:
 def number_of_seeds(suite: Suite, case: str, row: str) -> int:
     """Return the number of seeds of a row in a case; 1 if neither row nor case is random.
 
+    A case is random if it samples events or has errors of forecasts, which optima do not have.
+
     Args:
         suite: the suite.
         case: name of the case.
@@ -126,8 +131,11 @@ def number_of_seeds(suite: Suite, case: str, row: str) -> int:
     chosen = suite.rows[row]
     if chosen.seeds is not None:
         return chosen.seeds
-    sampled = any(dc.events.sampled for dc in data_centers(suite.cases[case], "held-out"))
-    return suite.seeds if sampled or chosen.is_random else 1
+    settings = suite.cases[case]
+    varies = any(dc.events.sampled for dc in data_centers(settings, "held-out")) or (
+        settings.forecast_error is not None and chosen.optimum is None
+    )
+    return suite.seeds if varies or chosen.is_random else 1
 
 
 def check_suite(suite: Suite) -> None:

@@ -37,7 +37,7 @@ from sdc_taichi.benchmark.suite_results import (
     read_result,
     read_suites,
 )
-from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
+from sdc_taichi.control import Controller, Idle, PerAgent
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import ALL, Contender, evaluate, prepare
@@ -247,7 +247,6 @@ def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
     settings, count = case.settings, len(case.settings.weeks)
     if weeks > count:
         raise ConfigError(f"verify {weeks}: case {case.name} has {count} weeks; valid are no more")
-    error = result.record.metrics.get("forecast_error")
     with prepare(
         data_centers(settings, "held-out"),
         [settings.weeks[count * k // weeks] for k in range(weeks)],
@@ -255,7 +254,7 @@ def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
         optimum=False,
         days=settings.days,
         seed=result.seed,
-        forecast_error=PERFECT if error is None else ForecastError.parse(str(error)),
+        forecast_error=settings.error,
     ) as prepared:
         controller = _submitted_policy(result, prepared.sim.fleet)
         again = evaluate(prepared, [Contender("again", controller)], beside=False).rows

@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from sdc_taichi.config import load_config, load_yaml, preset_names, validated
 from sdc_taichi.config.fields import Section, Text
-from sdc_taichi.control import ForecastError
+from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
@@ -85,6 +85,9 @@ class Case(Section):
     or the site of the configuration."""
     environment: dict[str, Any] = Field(default={})
     """Options of the training environments, such as their rewards."""
+    forecast_error: str | None = None
+    """Errors of the forecasts in training, validation and held-out weeks, such as
+    ``ci=0.1,temperature=1``; None gives perfect forecasts."""
     training_weeks: Weeks = Field(default="training", validate_default=True)
     """Weeks of the year, 0..51, in which agents learn."""
     validation_weeks: Weeks = Field(default="validation", validate_default=True)
@@ -97,6 +100,8 @@ class Case(Section):
     scored."""
     test: OtherDataCenters = OtherDataCenters()
     """Data centers for the results, if they differ from those of the training."""
+    rows: tuple[Name, ...] | None = None
+    """Names of the rows that run in the case; None selects those whose ``cases`` has it."""
     optimum: bool = True
     """True to compute optima, which give the share of the achievable saving, and the value of
     stored energy and waiting work at the end of a week."""
@@ -105,6 +110,18 @@ class Case(Section):
     @classmethod
     def _whole(cls, value: Any) -> Any:
         return _content(value)
+
+    @property
+    def error(self) -> ForecastError:
+        """Sizes of the errors of the forecasts."""
+        return PERFECT if self.forecast_error is None else ForecastError.parse(self.forecast_error)
+
+    @field_validator("forecast_error")
+    @classmethod
+    def _has_sizes(cls, value: str | None) -> str | None:
+        if value is not None:
+            ForecastError.parse(value)
+        return value
 
     @model_validator(mode="after")
     def _nothing_is_chosen_on_held_out_weeks(self) -> Self:
@@ -147,14 +164,11 @@ class Row(Section):
     together afterwards."""
     agents_alone: bool = False
     """True to run each trained agent also alone, while the others are idle."""
-    forecast_error: str | None = None
-    """Errors of the forecasts in the held-out weeks, such as ``ci=0.1,temperature=1``; None gives
-    perfect forecasts."""
     seeds: Seeds | None = None
     """Number of seeds, 1..1,000; None selects the number of the suite for rows with randomness, and
     1 for others."""
     cases: tuple[Name, ...] | None = None
-    """Cases in which the row runs; None selects all cases."""
+    """Cases in which the row runs; None selects all cases. A case with ``rows`` decides itself."""
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> Self:
@@ -169,10 +183,6 @@ class Row(Section):
             raise ValueError("best_of: none given; valid is one or more")
         if len(set(self.controllers)) < len(self.controllers):
             raise ValueError(f"best_of: {', '.join(self.controllers)}; valid is each once")
-        if self.forecast_error is not None:
-            if self.optimum is not None:
-                raise ValueError("forecast_error: without effect on an optimum; valid is without")
-            ForecastError.parse(self.forecast_error)
         return self
 
     @property
@@ -184,8 +194,8 @@ class Row(Section):
 
     @property
     def is_random(self) -> bool:
-        """True if the behaviour of the row depends on the seed."""
-        if self.train is not None or self.forecast_error is not None:
+        """True if the behaviour of the row depends on the seed, also with perfect forecasts."""
+        if self.train is not None:
             return True
         return any("random" in (parts_of(x).values() or [x]) for x in self.controllers)
 
@@ -246,10 +256,16 @@ class Suite(Section):
                     raise ValueError(
                         f"rows.{name}.cases: no case {case!r}; valid: {', '.join(self.cases)}"
                     )
-            cases = row.cases if row.cases is not None else tuple(self.cases)
-            without = [case for case in cases if not self.cases[case].optimum]
+            without = [x for x, case in self.cases.items() if not case.optimum]
+            without = [case for case in without if self.is_for(name, case)]
             if row.optimum is not None and without:
                 raise ValueError(f"rows.{name}: case {without[0]} has optimum false")
+        for name, settings in self.cases.items():
+            for label in settings.rows or ():
+                if label not in self.rows:
+                    raise ValueError(
+                        f"cases.{name}.rows: no row {label!r}; valid: {', '.join(self.rows)}"
+                    )
         return self
 
     def to_yaml(self) -> str:
@@ -264,6 +280,8 @@ class Suite(Section):
             row: name of the row.
             case: name of the case.
         """
+        if (rows := self.cases[case].rows) is not None:
+            return row in rows
         cases = self.rows[row].cases
         return cases is None or case in cases
 
@@ -289,6 +307,9 @@ class Suite(Section):
                     meant = suggestion_or_valid(name, values[kind])
                     raise ConfigError(f"suite {self.name}: no {kind[:-1]} {name!r}{meant}")
             values[kind] = {k: v for k, v in values[kind].items() if not names or k in names}
+        for case in values["cases"].values():
+            if case["rows"] is not None:
+                case["rows"] = tuple(row for row in case["rows"] if row in values["rows"])
         for name, row in list(values["rows"].items()):
             if row["cases"] is not None:
                 row["cases"] = tuple(case for case in row["cases"] if case in values["cases"])

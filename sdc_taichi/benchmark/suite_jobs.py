@@ -31,7 +31,7 @@ from sdc_taichi.benchmark.store import METRICS_FILE, ROWS_FILE, Record
 from sdc_taichi.benchmark.suite import Case, Part, Row
 from sdc_taichi.benchmark.suite_results import RowMetrics
 from sdc_taichi.config import validated
-from sdc_taichi.control import PERFECT, ForecastError, make_controller
+from sdc_taichi.control import make_controller
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, short_name
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import (
@@ -116,8 +116,7 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 archive.extractall(optima)
         made = _made(task, Path(scratch), optima)
-        error = task.row.forecast_error
-        with _weeks(task, "held-out", optima, error) as weeks:
+        with _weeks(task, "held-out", optima) as weeks:
             rows = _rows(task, made, weeks)
             metrics = _metrics(task, made, weeks)
     rows = rows.drop(columns="training").assign(controller=task.name)
@@ -294,9 +293,7 @@ def _files_of_training(folder: Path) -> dict[str, bytes]:
 
 
 @contextlib.contextmanager
-def _weeks(
-    task: _Task, part: Part, optima: Path, forecast_error: str | None = None
-) -> Iterator[DataCenterWeeks]:
+def _weeks(task: _Task, part: Part, optima: Path) -> Iterator[DataCenterWeeks]:
     """Yield data centers and weeks of a part of a case, with their optima.
 
     A warning is issued if an optimum was missing and had to be computed again.
@@ -310,7 +307,7 @@ def _weeks(
         uncoordinated=part == "held-out" and task.row.optimum == "achieved",
         days=task.case.days,
         seed=task.seed,
-        forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
+        forecast_error=task.case.error,
         cache=optima,
     ) as weeks:
         if set(optima.iterdir()) > known:
@@ -382,7 +379,6 @@ def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]
         "weeks": list(task.case.weeks),
         "steps": weeks.steps,
         "scored_from": weeks.scored_from,
-        "forecast_error": task.row.forecast_error,
         "fingerprint": weeks.sim.fingerprint(),
         "has_optimum": weeks.optimum is not None,
         "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),

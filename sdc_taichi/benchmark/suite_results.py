@@ -53,8 +53,6 @@ class RowMetrics(Record):
 
     chosen: _Text | None = None
     """Name of the controller that was chosen in the validation weeks."""
-    forecast_error: _Text | None = None
-    """Errors of the forecasts in the held-out weeks; None for perfect forecasts."""
 
 
 class SubmissionRecord(Record):

@@ -18,7 +18,16 @@ from sdc_taichi.learning.policy import WEIGHTS
 _FUNCTIONS = "sdc_taichi.benchmark.suite_jobs"
 OPTIMA, ROWS = "optima", "rows"
 """Names of the two stages of a suite's execution."""
-_MAY_CHANGE = ("suite.rows.*", "suite.title", "suite.seeds", "suite.training*", "*.about")
+_NOT_OF_OPTIMA = {"about", "rows", "training_weeks", "forecast_error"}
+"""Fields of cases on which optima do not depend."""
+_MAY_CHANGE = (
+    "suite.rows.*",
+    "suite.cases.*.rows",
+    "suite.title",
+    "suite.seeds",
+    "suite.training*",
+    "*.about",
+)
 """Patterns of suite settings that may change when a study is resumed; affected jobs run again."""
 
 
@@ -61,30 +70,39 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
 def reference_jobs(suite: Suite) -> list[Job]:
     """Return the jobs that compute the optima of a suite, one for each case, part and site.
 
+    Cases with the same optima, such as those with other forecasts, share the jobs of the first.
+
     Args:
         suite: the suite.
     """
+    jobs: dict[str, Job] = {}
+    for name in suite.cases:
+        for part in _parts_needed(suite, name):
+            for job in _references(suite, name, part):
+                jobs.setdefault(job.key, job)
+    return list(jobs.values())
+
+
+def _references(suite: Suite, name: str, part: Part) -> list[Job]:
+    """Return the jobs that compute the optima of a part of a case, one for each site."""
     jobs = []
-    for name, case in suite.cases.items():
-        parts, files = (_parts_needed(suite, name), _files(case)) if case.optimum else ((), {})
-        for part in parts:
-            for site, config in enumerate(data_centers(case, part)):
-                values = {
-                    "case": case.model_dump(mode="json", exclude={"about"}),
-                    "part": part,
-                    "site": site,
-                    "objective": suite.objective,
-                    **files,
-                }
-                partition = {
-                    "suite": suite.name,
-                    "case": name,
-                    "row": f"{REFERENCE}-{part}-{config.name}",
-                    "seed": "0",
-                }
-                jobs.append(
-                    Job(f"{_FUNCTIONS}:solve_reference", values, partition, check=check_reference)
-                )
+    case = suite.cases[name]
+    files = _files(case)
+    for site, config in enumerate(data_centers(case, part) if case.optimum else ()):
+        values = {
+            "case": case.model_dump(mode="json", exclude=_NOT_OF_OPTIMA),
+            "part": part,
+            "site": site,
+            "objective": suite.objective,
+            **files,
+        }
+        partition = {
+            "suite": suite.name,
+            "case": name,
+            "row": f"{REFERENCE}-{part}-{config.name}",
+            "seed": "0",
+        }
+        jobs.append(Job(f"{_FUNCTIONS}:solve_reference", values, partition, check=check_reference))
     return jobs
 
 
@@ -96,21 +114,25 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         references: finished jobs that computed the optima of the suite.
     """
     jobs = []
+    names = {job.key: job.name for job in references}
     files = {name: _files(case) for name, case in suite.cases.items()}
+    solved = {
+        (name, part): {
+            names[x.key]: x.key for x in _references(suite, name, part) if x.key in names
+        }
+        for name in suite.cases
+        for part in _parts_needed(suite, name)
+    }
     for label, row in suite.rows.items():
         for name, case in suite.cases.items():
             if not suite.is_for(label, name):
                 continue
-            parts, policies = _parts_of(row), _policies(row)
-            inputs = {
-                job.name: job.key
-                for job in references
-                if job.partition["case"] == name and job.values["part"] in parts
-            }
+            policies = _policies(row)
+            inputs = {k: v for part in _parts_of(row) for k, v in solved[name, part].items()}
             for seed in range(number_of_seeds(suite, name, label)):
                 values = {
                     "name": label,
-                    "case": case.model_dump(mode="json", exclude={"about"}),
+                    "case": case.model_dump(mode="json", exclude={"about", "rows"}),
                     "row": row.model_dump(mode="json", exclude={"about", "seeds", "cases"}),
                     "training": suite.training if row.train is not None else {},
                     "objective": suite.objective,
