@@ -100,7 +100,7 @@ def completed(*words: str) -> list[str]:
         (["simulate", "--controller", "const"], ["constant:"]),
         (["data", "show", "N"], ["NY"]),
         (["train", "had"], ["had3qn"]),
-        (["benchmark", "run", "carbon-"], ["carbon-rich"]),
+        (["benchmark", "run", "oper"], ["operator"]),
         (["new", "mine.yaml", "--from", "hall_o"], ["hall_of_2026"]),
         (["simulate", "my_own"], []),
     ],

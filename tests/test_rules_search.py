@@ -37,3 +37,17 @@ def test_search_finds_the_best_of_each_agent_and_asks_once() -> None:
 
 def test_idle_stays_where_no_rule_is_better() -> None:
     assert best_rules("cost", lambda _: 0.0) == "load=idle,cooling=idle,battery=idle"
+
+
+def test_rules_rank_by_the_value_of_a_kwh() -> None:
+    asked: list[str] = []
+
+    def figure(spec: str) -> float:
+        asked.append(spec)
+        return 0.0
+
+    best_rules("cost+0.1*carbon+20*heat", figure)
+    assert "load=rank-6h:0.1:0.1*carbon+cost,cooling=idle,battery=idle" in asked
+    asked.clear()
+    best_rules("heat", figure)
+    assert len(asked) == len(COOLING)

@@ -42,6 +42,13 @@ def test_settings_of_every_scenario_are_read_back_equal(scenario: str, tmp_path:
     assert {config.site.start for config in configs} >= {"01-01", "12-17"}
 
 
+def test_agents_observe_prices_where_rewards_depend_on_them() -> None:
+    by_term = {"agent_bat": {"battery_carbon": 5.0, "battery_cost": 10.0}}
+    for rewards, observes in (("default", False), ("bill", True), (by_term, True)):
+        made = make_settings({"algorithm": "ippo", "environment": {"rewards": rewards}})
+        assert ("price_forecast" in dict(made.environment.features or {})["agent_bat"]) == observes
+
+
 def test_agents_of_halls_share_a_policy_unless_set() -> None:
     hall = {"algorithm": "ippo", "scenario": "hall"}
     shared = make_settings(hall)

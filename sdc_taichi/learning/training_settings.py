@@ -130,7 +130,7 @@ def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the default environment options of trainings.
 
     By default, actions are continuous, and agents observe hourly forecasts for the coming day: the
-    carbon intensity relative to its range and, with rewards ``bill``, the price.
+    carbon intensity relative to its range and, with rewards that depend on it, the price.
 
     Args:
         options: options that the user or a scenario sets, by name; they take precedence over the
@@ -168,8 +168,15 @@ def _features(agent: str, options: Mapping[str, Any]) -> tuple[str, ...]:
     if agent == "agent_dc":
         return (*(name for name in names if name != "ci_forecast"), "queue")
     names = tuple(name for name in names if name not in ("ci_forecast", "ci_change"))
-    prices = _PRICES if options.get("rewards") == "bill" else ()
-    return (*names, *_SHAPE_OF_DAY, *prices)
+    return (*names, *_SHAPE_OF_DAY, *(_PRICES if _has_costs(options.get("rewards")) else ()))
+
+
+def _has_costs(rewards: Any) -> bool:
+    """Return True if rewards depend on prices: reward set ``bill``, or terms such as ``cost``."""
+    if not isinstance(rewards, Mapping):
+        return bool(rewards == "bill")
+    scales = [x for x in rewards.values() if isinstance(x, Mapping)]
+    return any(str(term).endswith("cost") for terms in scales for term in terms)
 
 
 MOST_STEPS = 10**12

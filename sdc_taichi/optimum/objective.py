@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -103,6 +103,12 @@ class Objective:
             for name, weight in weights.items()
             if weight
         )
+
+    @property
+    def of_energy(self) -> str:
+        """Text of the terms that give a kWh its value: carbon, energy and cost; empty if none."""
+        weights = (self.carbon, self.energy, self.cost)
+        return str(replace(self, water=0.0, heat=0.0)) if any(weights) else ""
 
     @property
     def unit(self) -> str:
