@@ -65,6 +65,7 @@ def frame_of(
         "controller": "",
         "moves": moves,
         "site": np.repeat(SITES, len(WEEKS)),
+        "year": 10,
         "week": list(WEEKS) * len(SITES),
         "figure": figure,
         "valued_figure": figure,
@@ -151,7 +152,13 @@ def settings_of(rows: Sequence[str] = tuple(ROWS)) -> dict[str, Any]:
         "accounting": "standard",
         "seeds": 3,
         "cases": {
-            "two-sites": {"about": "Two sites.", "sites": ["CA", "NY"], "weeks": list(WEEKS)}
+            "two-sites": {
+                "about": "Two sites.",
+                "sites": ["CA", "NY"],
+                "training_weeks": [0],
+                "validation_weeks": [1],
+                "weeks": list(WEEKS),
+            }
         },
         "rows": {name: ROWS[name] for name in rows},
     }

@@ -64,7 +64,7 @@ def test_rows_are_of_each_controller_agent_and_week(found: Evaluation) -> None:
     assert own["training"].tolist() == [7] * 8
     assert rows[rows["controller"] == "g36"]["training"].isna().all()
     assert found.missing == ()
-    assert found.strata.tolist() == [0, 0, 1, 1]
+    assert found.strata[:, 0].tolist() == [1, 1, 0, 0]
 
 
 def test_shares_are_zero_for_idle_commands_and_one_for_the_optimum(

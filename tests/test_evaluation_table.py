@@ -32,6 +32,7 @@ def rows(
         "training": training,
         "moves": moves,
         "site": ["ny", "ny", "ca", "ca"],
+        "year": 10,
         "week": [3, 7, 3, 7],
         "figure": valued + 5.0,
         "valued_figure": valued,
@@ -58,7 +59,7 @@ def found() -> Evaluation:
         objective=Objective(carbon=1.0),
         alone={"load": 0.99 * IDLE, "battery": 0.96 * IDLE},
         uncoordinated={},
-        strata=np.array([0, 0, 1, 1]),
+        strata=np.array([[0, 0], [0, 0], [1, 0], [1, 0]]),
         missing=(),
     )
 

@@ -189,7 +189,7 @@ def test_results_that_cannot_be_compared_are_refused(study: Path, tmp_path: Path
     with pytest.raises(ConfigError, match=r"row=g36/seed=0: idle commands reach 100\.1 in week 3"):
         read_suites([store.folder])
     store.keep(done_job("g36", 0, frame[frame["week"] != 7], spec=ROWS["g36"]))
-    with pytest.raises(ConfigError, match="row=g36/seed=0: is of other sites or weeks"):
+    with pytest.raises(ConfigError, match="row=g36/seed=0: is of other sites, years or weeks"):
         read_suites([store.folder])
     store.keep(done_job("g36", 0, frame.assign(figure=1.0), spec=ROWS["g36"]))
     with pytest.raises(ConfigError, match="hold other results of one seed of one row"):

@@ -62,6 +62,7 @@ def test_cells_are_reached_again(suite: str) -> None:
     with prepare(
         configs,
         [week],
+        years=[int(year)] if (year := cell_of["idle"].get("year")) else (),
         objective=published["objective"],
         optimum=solved,
         days=case.days,

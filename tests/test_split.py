@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import yaml
 
 from sdc_taichi import ConfigError, load_config
 from sdc_taichi.learning.split import (
@@ -14,13 +15,16 @@ from sdc_taichi.learning.split import (
     data_center_weeks,
     parse_weeks,
 )
+from sdc_taichi.learning.training_settings import TrainingSettings
 
 
 def test_each_week_is_in_one_part_of_the_year() -> None:
-    assert sorted([*HELD_OUT, *VALIDATION, *TRAINING]) == list(range(WEEKS))
-    assert (len(HELD_OUT), len(VALIDATION), len(TRAINING)) == (13, 7, 32)
-    assert HELD_OUT[:2] + HELD_OUT[-1:] == (3, 7, 51)
-    assert VALIDATION == (1, 9, 17, 25, 33, 41, 49)
+    assert len({*HELD_OUT, *VALIDATION, *TRAINING}) == WEEKS - 8
+    assert (len(HELD_OUT), len(VALIDATION), len(TRAINING)) == (8, 4, 32)
+    assert HELD_OUT[:3] == (2, 3, 15)
+    assert VALIDATION == (5, 18, 31, 44)
+    used = {*VALIDATION, *TRAINING}
+    assert not used & {(week + days) % WEEKS for week in HELD_OUT for days in (-1, 0, 1)}
 
 
 def test_weeks_are_named_or_numbered() -> None:
@@ -50,3 +54,17 @@ def test_weeks_of_data_centers_begin_on_their_first_day() -> None:
     assert [config.name for config in found] == ["a-0", "a-3", "a-51", "b-0", "b-3", "b-51"]
     assert [config.site.start for config in found[:3]] == ["01-01", "01-22", "12-24"]
     assert found[5].hall == two[1].hall
+
+
+def test_copies_are_in_each_year_and_week() -> None:
+    two = [load_config("tiny", [f"name={name}"]) for name in ("a", "b")]
+    copies = data_center_weeks(two, (0, 3), (5, 6))
+    assert [x.name for x in copies[:5]] == ["a-5-0", "a-5-3", "a-6-0", "a-6-3", "b-5-0"]
+    assert [x.site.seed for x in copies] == [5, 5, 6, 6] * 2
+
+
+def test_pairs_of_site_and_week_of_a_training_have_years_in_turn() -> None:
+    settings = TrainingSettings(algorithm="ippo", sites=("NY", "CA"), years=(5, 6), weeks=(0, 1, 2))
+    years = [x.site.seed for x in settings.data_centers_of_weeks()]
+    assert years == [5, 6, 5, 6, 5, 6]
+    assert TrainingSettings.model_validate(yaml.safe_load(settings.to_yaml())) == settings

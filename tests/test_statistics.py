@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,12 +12,13 @@ from sdc_taichi import ConfigError
 from sdc_taichi.learning.statistics import (
     bootstrap_interval,
     change_pct,
+    drawn_weeks,
     interquartile_mean,
     performance_profile,
     probability_of_improvement,
     share_pct,
 )
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I64
 
 
 def generator() -> np.random.Generator:
@@ -53,27 +56,41 @@ def test_probability_of_improvement_is_the_share_of_pairs_that_are_lower() -> No
 
 def test_interval_of_one_training_is_that_of_its_weeks() -> None:
     sample = generator().normal(3.0, 2.0, size=(1, 400))
-    found = bootstrap_interval(mean, [sample], np.zeros(400, dtype=np.int64), generator())
+    found = bootstrap_interval(mean, [sample], in_years(np.zeros(400)), generator())
     half = 1.96 * sample.std() / 20.0
     assert found.value == pytest.approx(sample.mean())
     assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
     assert found.low < found.value < found.high
 
 
-def test_differences_between_strata_do_not_widen_an_interval() -> None:
-    weeks = generator().normal(size=200)
-    strata = np.arange(200) % 2
-    apart = (weeks + 100.0 * strata)[None]
-    mixed = bootstrap_interval(mean, [apart], 0 * strata, generator())
-    found = bootstrap_interval(mean, [apart], strata, generator())
-    alone = bootstrap_interval(mean, [weeks[None]], strata, generator())
-    assert mixed.high - mixed.low > 10.0
-    assert found.high - found.low == pytest.approx(alone.high - alone.low)
+def in_years(years: Any, sites: Any = 0) -> I64:
+    """Strata of weeks, of which each is in a year of a site."""
+    return np.stack(np.broadcast_arrays(sites, years), axis=1).astype(np.int64)
+
+
+def test_sites_years_and_weeks_are_drawn_level_by_level() -> None:
+    sites, years = np.repeat([0, 1, 2], 6), np.tile(np.repeat([0, 1], 3), 3)
+    drawn = drawn_weeks(in_years(years, sites), generator(), 4000)
+    for at in range(0, 18, 6):
+        assert len(np.unique(sites[drawn[:, at : at + 6]], axis=1)[0]) <= 6
+        assert (sites[drawn[:, at : at + 6]] == sites[drawn[:, [at]]]).all()
+    assert (years[drawn[:, :3]] == years[drawn[:, [0]]]).all()
+    assert (years[drawn[:, 0]] != years[drawn[:, 3]]).mean() == pytest.approx(0.5, abs=0.05)
+    assert np.bincount(drawn.ravel()) / drawn.size == pytest.approx(1 / 18, rel=0.1)
+
+
+def test_differences_between_sites_widen_an_interval() -> None:
+    weeks, sites = np.zeros((1, 200)), np.arange(200) % 20
+    apart = weeks + generator().normal(size=20)[sites]
+    found = bootstrap_interval(mean, [apart], in_years(0, sites), generator())
+    # The spread of a mean of twenty draws, which no number of weeks makes smaller.
+    half = 1.96 * apart.std() / np.sqrt(20)
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
 
 
 def test_trainings_are_drawn_whole() -> None:
     trainings = np.repeat([[1.0], [2.0], [4.0], [5.0]], 50, axis=1)
-    found = bootstrap_interval(mean, [trainings], np.zeros(50, dtype=np.int64), generator())
+    found = bootstrap_interval(mean, [trainings], in_years(np.zeros(50)), generator())
     # The spread of a mean of four draws, which no number of weeks makes smaller.
     spread = np.std([1.0, 2.0, 4.0, 5.0]) / 2
     assert found.value == 3.0
@@ -82,7 +99,7 @@ def test_trainings_are_drawn_whole() -> None:
 
 def test_samples_of_other_weeks_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sample \(2, 5\): valid is \(trainings, 4 weeks\)"):
-        bootstrap_interval(mean, [np.ones((2, 5))], np.zeros(4, dtype=np.int64), generator())
+        bootstrap_interval(mean, [np.ones((2, 5))], in_years(np.zeros(4)), generator())
 
 
 def test_performance_profile_is_the_share_of_runs_above_a_threshold() -> None:
@@ -96,7 +113,7 @@ def test_performance_profile_is_the_share_of_runs_above_a_threshold() -> None:
 
 def test_seeds_that_decide_inputs_are_drawn_together() -> None:
     years = np.repeat([[1.0], [2.0], [40.0], [5.0]], 50, axis=1)
-    strata = np.zeros(50, dtype=np.int64)
+    strata = in_years(np.zeros(50))
 
     def difference(paired: bool) -> float:
         found = bootstrap_interval(

@@ -151,7 +151,7 @@ def test_forged_folders_are_one_line(study: Path, tmp_path: Path, name: str) -> 
     [
         (frame_of(0.05).drop(columns="cfp_kg"), "column cfp_kg; valid is a finite number"),
         (frame_of(0.05).assign(water_l=float("nan")), "column water_l; valid is a finite number"),
-        (frame_of(0.05)[::-1], "is of other sites or weeks than"),
+        (frame_of(0.05)[::-1], "is of other sites, years or weeks than"),
         (
             frame_of(0.05).assign(idle_figure=1.00001 * IDLE),
             "idle commands reach 100.001 ",

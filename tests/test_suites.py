@@ -205,7 +205,15 @@ def test_the_quick_form_of_chosen_cases_and_rows_is_whole(tmp_path: Path) -> Non
 
 def test_the_test_may_be_of_other_data_centers() -> None:
     other = {"sites": ["TX"], "overrides": {"site": {"seed": 3}}}
-    suite = small(**case(test=other))
+    suite = small(**case(test=other, years=[5, 6], validation_years=[7]))
+    settings = training_settings(
+        suite.cases["tiny"], suite.rows["ippo"], objective="carbon", seed=0, training={}
+    )
+    assert (settings.years, settings.validation.years) == ((5, 6), (7,))
+    names = [job.partition["row"] for job in reference_jobs(suite)]
+    assert names == [f"reference-held-out-tx-{year}" for year in (5, 6)] + [
+        f"reference-validation-{site}-7" for site in ("ny", "ca")
+    ]
     held_out, validation = (
         data_centers(suite.cases["tiny"], p) for p in ("held-out", "validation")
     )

@@ -186,22 +186,22 @@ def test_a_training_says_how_long_it_solves_optima(
     now_s = 0.0
     monkeypatch.setattr("sdc_taichi.cli.train.time.monotonic", lambda: now_s)
     weeks = make_settings({"algorithm": "ppo", "sites": ["ny", "ca"]}, "train").validation_weeks()
-    assert weeks == 14
+    assert weeks == 8
     with train_command._progress_of_training(weeks, shown=True) as reports:
         on_stage = reports["on_stage"]
         for stage, second_each in (("tables", 0.1), ("programmes", 3.0)) if solved else ():
             for done in range(4):
-                on_stage(stage, done, 14)
+                on_stage(stage, done, 8)
                 now_s += second_each
-        for done in range(14):
-            on_stage("values of ends", done, 14)
+        for done in range(8):
+            on_stage("values of ends", done, 8)
             now_s += 4.0 if solved else 0.01
     lines = capsys.readouterr().err.splitlines()
     if not solved:
         assert lines == []
         return
-    assert lines[0].startswith("First the optima of 14 validation weeks are solved, once")
-    of_programmes = 3.0 * (13 + train_command.ENDS_PER_PROGRAMME * 14)
+    assert lines[0].startswith("First the optima of 8 validation weeks are solved, once")
+    of_programmes = 3.0 * (7 + train_command.ENDS_PER_PROGRAMME * 8)
     left = duration(of_programmes)
-    assert lines[1] == f"programmes of 1/14 weeks; training begins in about {left}"
-    assert "values of ends of 1/14 weeks; training begins in about 0:52" in lines
+    assert lines[1] == f"programmes of 1/8 weeks; training begins in about {left}"
+    assert "values of ends of 1/8 weeks; training begins in about 0:28" in lines

@@ -197,7 +197,7 @@ def write_cells(suite: SuiteResults, board: Leaderboard, folder: Path) -> None:
     for name, results in chosen.items():
         record = results[0].record
         weeks = [x.frame[x.frame["moves"] == ALL].iloc[:1].reset_index(drop=True) for x in results]
-        cell = weeks[0][["site", "week", *CELL_COLUMNS]]
+        cell = weeks[0][["site", "week", "year", *CELL_COLUMNS]]
         spec = record.metrics.get("chosen") or record.values["row"].get("controller")
         cell.insert(0, "row", name)
         cell.insert(1, "controller", spec or f"policy:{name}")

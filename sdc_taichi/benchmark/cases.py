@@ -19,7 +19,7 @@ from sdc_taichi.learning.training_settings import (
 )
 from sdc_taichi.sim.fleet import build_fleet
 
-_FIXED = ("weeks", "seed", "scenario", "config", "overrides", "sites")
+_FIXED = ("weeks", "years", "seed", "scenario", "config", "overrides", "sites")
 """Training settings that the case or the seed determines; a row cannot set them."""
 
 
@@ -36,7 +36,7 @@ def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
     """
     values = _data_center_values(case)
     if part == "held-out":
-        changes = case.test.model_dump(exclude_defaults=True)
+        changes = case.test.model_dump(exclude={"years"}, exclude_defaults=True)
         values = merged(values, changes)
     # The settings require an algorithm, which does not affect the data centers.
     return make_settings({"algorithm": "ippo"} | values, "case").data_centers_of_sites()
@@ -50,6 +50,16 @@ def weeks_of(case: Case, part: Part) -> tuple[int, ...]:
         part: ``held-out`` or ``validation``.
     """
     return case.weeks if part == "held-out" else case.validation_weeks
+
+
+def years_of(case: Case, part: Part) -> tuple[int, ...]:
+    """Return the seeds of the synthetic years of a part of a case; empty for that of the sites.
+
+    Args:
+        case: the case.
+        part: ``held-out`` or ``validation``.
+    """
+    return (case.test.years if part == "held-out" else case.validation_years) or case.years
 
 
 def training_settings(
@@ -80,10 +90,12 @@ def training_settings(
             raise ConfigError(f"train: {name}: is that of the case; valid is without")
     of_case: dict[str, Any] = {
         "weeks": case.training_weeks,
+        "years": case.years,
         "seed": seed,
         "tensorboard": False,
         "validation": {
             "weeks": case.validation_weeks,
+            "years": years_of(case, "validation"),
             "days": case.days,
             "objective": objective,
             "optimum": case.optimum,

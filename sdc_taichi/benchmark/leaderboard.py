@@ -177,7 +177,7 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
 def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
     """Return True if a row has enough weeks and seeds for confidence intervals and a rank."""
     seeds = len(case.rows[name])
-    weeks = int(np.bincount(evaluation.strata).min())
+    weeks = int(np.bincount(evaluation.strata[:, 0]).min())
     return weeks >= FEWEST and (seeds >= FEWEST or case.kinds[name] != LEARNER)
 
 

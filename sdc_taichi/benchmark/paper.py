@@ -212,7 +212,7 @@ def _compared_row(
 
 def _interval(statistic: Statistic, *samples: F64) -> Interval:
     """Return a statistic of samples from one site with its bootstrap interval."""
-    strata = np.zeros(samples[0].shape[1], dtype=np.int64)
+    strata = np.zeros((samples[0].shape[1], 2), dtype=np.int64)
     generator = np.random.Generator(np.random.PCG64(_SEED))
     return bootstrap_interval(statistic, samples, strata, generator)
 

@@ -22,6 +22,7 @@ from sdc_taichi.benchmark.leaderboard import (
     leaderboard,
 )
 from sdc_taichi.benchmark.paper import PAPER, PAPER_TITLES, PAPER_UNITS, compared_tables
+from sdc_taichi.benchmark.result_table import PLACE
 from sdc_taichi.benchmark.suite_results import (
     ACHIEVED,
     BOUND,
@@ -51,10 +52,10 @@ _LEAST_SHARE_PCT = -100.0
 _THRESHOLDS_PCT = np.linspace(-25.0, 110.0, 136)
 READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
-    "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
-    "draws seeds whole and weeks within their site. The interquartile mean is that of the changes "
-    "of all seeds and weeks. The share of the achievable is 0 for idle commands and 100 % for the "
-    "best path known with perfect foresight.",
+    "below 0 is better. Values in brackets are 95 % intervals of a bootstrap, which draws seeds, "
+    "sites, years within their site, and weeks within their year. The interquartile mean is that "
+    "of the changes of all seeds and weeks. The share of the achievable is 0 for idle commands and "
+    "100 % for the best path known with perfect foresight.",
     "Rows share a place unless the interval of the paired difference separates each of them from "
     "each row of the next place; the order within a place is that of the suite. Of many pairs that "
     "do not differ, about one in twenty is separated by chance. Optimum and bound know the future "
@@ -335,11 +336,12 @@ def weeks_text(board: Leaderboard) -> str:
         board: tables of the case.
     """
     first = next(iter(board.case.rows.values()))[0].frame
-    sites, weeks = list(dict.fromkeys(first["site"])), list(dict.fromkeys(first["week"]))
+    sites, years, weeks = (list(dict.fromkeys(first[name])) for name in PLACE)
     objective = board.case.objective
+    named = f" of years {', '.join(map(str, years))}" if len(years) > 1 else ""
     return (
         f"The objective is {objective} ({objective.unit}), in weeks "
-        f"{', '.join(map(str, weeks))} of {names_text([str(site) for site in sites])}."
+        f"{', '.join(map(str, weeks))}{named} of {names_text([str(site) for site in sites])}."
     )
 
 

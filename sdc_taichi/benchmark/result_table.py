@@ -81,9 +81,12 @@ METRIC_COLUMNS: Mapping[str, Column] = {
     "hottest_inlet_c": Column(low=AIR_LIMITS_C[0], high=AIR_LIMITS_C[1], may_lack=True),
 }
 """Columns of the metrics of a run that the tables of suites contain."""
+PLACE = ("site", "year", "week")
+"""Columns that identify a data-center week."""
 SUITE_COLUMNS: Mapping[str, Column] = {
     "moves": Column("text", texts=(ALL, *MOVES, *WAYS)),
     "site": Column("text"),
+    "year": Column("whole number"),
     "week": Column("whole number", high=WEEKS - 1),
     "figure": Column(),
     "valued_figure": Column(may_lack=True),
@@ -147,16 +150,16 @@ def read_suite_rows(content: bytes, path: Path) -> pd.DataFrame:
     """
     frame = read_rows(content, path, SUITE_COLUMNS)
     weeks = {
-        str(moves): list(zip(rows["site"], rows["week"], strict=True))
+        str(moves): list(zip(*(rows[name] for name in PLACE), strict=True))
         for moves, rows in frame.groupby("moves", sort=False)
     }
-    expected = list(itertools.product(frame["site"].unique(), frame["week"].unique()))
+    expected = list(itertools.product(*(frame[name].unique() for name in PLACE)))
     for moves in {ALL: None, **weeks}:
         if weeks.get(moves) != expected:
             count = len(weeks.get(moves, []))
             raise ConfigError(
-                f"{path}: columns site and week, {count} rows of moves {moves}; valid are "
-                f"{len(expected)}, each week of each site once, sites one after another"
+                f"{path}: columns {', '.join(PLACE)}, {count} rows of moves {moves}; valid are "
+                f"{len(expected)}, each week of each year of each site once, in this order"
             )
     missing = frame[[*METRICS]].isna()
     # Runs have all metrics, and bounds of the optimum have none.

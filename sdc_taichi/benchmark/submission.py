@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sdc_taichi.atomic_file import FileClaim, naming_errors
-from sdc_taichi.benchmark.cases import data_centers
+from sdc_taichi.benchmark.cases import data_centers, years_of
 from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, parquet
-from sdc_taichi.benchmark.result_table import METRIC_COLUMNS
+from sdc_taichi.benchmark.result_table import METRIC_COLUMNS, PLACE
 from sdc_taichi.benchmark.store import JOBS, METRICS_FILE, ResultStore, read_record, write_record
 from sdc_taichi.benchmark.suite import REFERENCE
 from sdc_taichi.benchmark.suite_results import (
@@ -250,6 +250,7 @@ def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
     with prepare(
         data_centers(settings, "held-out"),
         [settings.weeks[count * k // weeks] for k in range(weeks)],
+        years=years_of(settings, "held-out"),
         objective=case.objective,
         optimum=False,
         days=settings.days,
@@ -259,12 +260,12 @@ def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
         controller = _submitted_policy(result, prepared.sim.fleet)
         again = evaluate(prepared, [Contender("again", controller)], beside=False).rows
     whole = result.frame[result.frame["moves"] == ALL]
-    both = again.merge(whole, on=["site", "week"], suffixes=("", "_stated"))
+    both = again.merge(whole, on=[*PLACE], suffixes=("", "_stated"))
     difference = ((both["figure_stated"] - both["figure"]) / both["figure"]).abs()
     if (worst := float(difference.max())) > _SAME:
         row = both.iloc[int(np.argmax(difference))]
         raise ConfigError(
-            f"{result.folder}: week {row['week']} of {row['site']}: figure "
+            f"{result.folder}: week {row['week']} of year {row['year']} of {row['site']}: figure "
             f"{row['figure_stated']:.9g}, and its policy reaches {row['figure']:.9g}; valid are "
             "figures of the policy"
         )

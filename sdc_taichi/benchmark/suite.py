@@ -22,7 +22,7 @@ from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
-from sdc_taichi.learning.training_settings import merged, read_values
+from sdc_taichi.learning.training_settings import Year, merged, read_values
 from sdc_taichi.optimum.objective import Objective
 
 REFERENCE = "reference"
@@ -60,6 +60,9 @@ class OtherDataCenters(Section):
     section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, with one data center for each site; an empty list selects those of the training."""
+    years: tuple[Year, ...] = ()
+    """Seeds of the synthetic years of each data center; an empty list selects those of the
+    training."""
 
     @field_validator("config")
     @classmethod
@@ -83,6 +86,12 @@ class Case(Section):
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, with one data center for each site; an empty list selects the sites of the scenario,
     or the site of the configuration."""
+    years: tuple[Year, ...] = ()
+    """Seeds of the synthetic years of the training, which pairs of site and week have in turn; an
+    empty list selects the year of the configuration."""
+    validation_years: tuple[Year, ...] = ()
+    """Seeds of the synthetic years of each data center in the validation weeks; an empty list
+    selects those of the training."""
     environment: dict[str, Any] = Field(default={})
     """Options of the training environments, such as their rewards."""
     forecast_error: str | None = None

@@ -23,6 +23,7 @@ from sdc_taichi.benchmark.cases import (
     data_centers,
     training_settings,
     weeks_of,
+    years_of,
 )
 from sdc_taichi.benchmark.jobs import Inputs, JobResult
 from sdc_taichi.benchmark.result_table import read_suite_rows
@@ -63,19 +64,20 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
     In held-out weeks, agents that do not plan together are solved for as well.
 
     Args:
-        values: ``case``, ``part``, index of the ``site``, and ``objective``.
+        values: ``case``, ``part``, index of the ``site``, ``year`` or None, and ``objective``.
 
     Returns:
         Result without rows; its files are cache entries from which ``optimum.solve`` reads the
         optima.
     """
     case, part = Case.model_validate(values["case"]), values["part"]
-    config = data_centers(case, part)[values["site"]]
+    config, year = data_centers(case, part)[values["site"]], values["year"]
     with (
         TemporaryDirectory() as folder,
         prepare(
             [config],
             weeks_of(case, part),
+            years=() if year is None else (year,),
             objective=values["objective"],
             uncoordinated=part == "held-out",
             days=case.days,
@@ -87,6 +89,7 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
         metrics = {
             "part": part,
             "site": config.name,
+            "year": year,
             "weeks": weeks.weeks,
             "idle_figure": weeks.idle.tolist(),
             "achieved_figure": weeks.optimum.achieved.tolist(),
@@ -141,6 +144,7 @@ class _SolvedMetrics(Record):
 
     part: Part
     site: str
+    year: int | None
     weeks: list[int]
     idle_figure: list[float]
     achieved_figure: list[float]
@@ -302,6 +306,7 @@ def _weeks(task: _Task, part: Part, optima: Path) -> Iterator[DataCenterWeeks]:
     with prepare(
         data_centers(task.case, part),
         weeks_of(task.case, part),
+        years=years_of(task.case, part),
         objective=task.objective,
         optimum=task.case.optimum,
         uncoordinated=part == "held-out" and task.row.optimum == "achieved",
@@ -357,6 +362,7 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
             "training": pd.array([pd.NA] * weeks.sim.size, dtype="Int64"),
             "moves": moves,
             "site": weeks.sites,
+            "year": weeks.years,
             "week": weeks.weeks,
             "figure": figure,
             "valued_figure": figure,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from sdc_taichi.benchmark.result_table import read_suite_rows
+from sdc_taichi.benchmark.result_table import PLACE, read_suite_rows
 from sdc_taichi.benchmark.store import (
     METRICS_FILE,
     STUDY_FILE,
@@ -27,7 +27,7 @@ from sdc_taichi.benchmark.store import (
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
 from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
-from sdc_taichi.learning.evaluation import ALL, Evaluation
+from sdc_taichi.learning.evaluation import ALL, Evaluation, strata_of
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS
@@ -241,13 +241,12 @@ def evaluation_of(case: CaseResults) -> Evaluation:
             frames.append(frame)
     rows = pd.concat([each.astype({"broken": object}) for each in frames], ignore_index=True)
     first = frames[0][frames[0]["moves"] == ALL]
-    sites = list(dict.fromkeys(first["site"]))
     return Evaluation(
         rows=rows,
         objective=case.objective,
         alone={moves: x for moves, x in beside.items() if moves in AGENTS},
         uncoordinated={moves: x for moves, x in beside.items() if moves in WAYS},
-        strata=np.array([sites.index(site) for site in first["site"]], dtype=np.int64),
+        strata=strata_of(first["site"], first["year"]),
         missing=(),
     )
 
@@ -298,24 +297,25 @@ def check_weeks(
         weeks = _weeks(result)
         if not weeks.index.equals(index):
             raise ConfigError(
-                f"{result.folder}: is of other sites or weeks than {first.folder}, of the same "
-                f"case {case}; valid are equal ones"
+                f"{result.folder}: is of other sites, years or weeks than {first.folder}, of the "
+                f"same case {case}; valid are equal ones"
             )
         idle = weeks["idle_figure"]
         known = first_of_seed.setdefault(result.seed, weeks)["idle_figure"]
         same = np.isclose(idle, known, rtol=_SAME, atol=0.0)
         if not same.all():
-            site, week = weeks.index[int(np.argmin(same))]
+            at = weeks.index[int(np.argmin(same))]
+            site, year, week = at
             raise ConfigError(
-                f"{result.folder}: idle commands reach {idle[site, week]:.8g} in week {week} of "
-                f"{site}, and {known[site, week]:.8g} elsewhere in case {case}; valid are results "
-                "of the same data centers"
+                f"{result.folder}: idle commands reach {idle[at]:.8g} in week {week} of year "
+                f"{year} of {site}, and {known[at]:.8g} elsewhere in case {case}; valid are "
+                "results of the same data centers"
             )
 
 
 def _weeks(result: RowResult) -> pd.DataFrame:
-    """Return the table rows of a result in which all agents act, indexed by site and week."""
-    return result.frame[result.frame["moves"] == ALL].set_index(["site", "week"])
+    """Return the table rows of a result in which all agents act, indexed by site, year and week."""
+    return result.frame[result.frame["moves"] == ALL].set_index([*PLACE])
 
 
 def _suite(stores: Sequence[ResultStore]) -> SuiteResults:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Protocol, get_args
 
-from sdc_taichi.benchmark.cases import data_centers, number_of_seeds, training_steps
+from sdc_taichi.benchmark.cases import data_centers, number_of_seeds, training_steps, years_of
 from sdc_taichi.benchmark.executors import JobSummary
 from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, input_paths, read_input
 from sdc_taichi.benchmark.store import ResultStore, Study
@@ -68,7 +69,7 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
 
 
 def reference_jobs(suite: Suite) -> list[Job]:
-    """Return the jobs that compute the optima of a suite, one for each case, part and site.
+    """Return the jobs that compute the optima of a suite, one for each case, part, site and year.
 
     Cases with the same optima, such as those with other forecasts, share the jobs of the first.
 
@@ -84,22 +85,24 @@ def reference_jobs(suite: Suite) -> list[Job]:
 
 
 def _references(suite: Suite, name: str, part: Part) -> list[Job]:
-    """Return the jobs that compute the optima of a part of a case, one for each site."""
+    """Return the jobs that compute the optima of a part of a case, one for each site and year."""
     jobs = []
     case = suite.cases[name]
     files = _files(case)
-    for site, config in enumerate(data_centers(case, part) if case.optimum else ()):
+    configs = data_centers(case, part) if case.optimum else ()
+    for (site, config), year in product(enumerate(configs), years_of(case, part) or (None,)):
         values = {
             "case": case.model_dump(mode="json", exclude=_NOT_OF_OPTIMA),
             "part": part,
             "site": site,
+            "year": year,
             "objective": suite.objective,
             **files,
         }
         partition = {
             "suite": suite.name,
             "case": name,
-            "row": f"{REFERENCE}-{part}-{config.name}",
+            "row": f"{REFERENCE}-{part}-{config.name}" + ("" if year is None else f"-{year}"),
             "seed": "0",
         }
         jobs.append(Job(f"{_FUNCTIONS}:solve_reference", values, partition, check=check_reference))

@@ -81,6 +81,8 @@ class DataCenterWeeks:
     """Simulator of B data-center weeks."""
     sites: tuple[str, ...]
     """Name of each data center without its week, B."""
+    years: tuple[int, ...]
+    """Seed of the synthetic year of each data center (``site.seed``), B."""
     weeks: tuple[int, ...]
     """Week of the year of each data center, 0..51, B."""
     objective: Objective
@@ -106,9 +108,8 @@ class DataCenterWeeks:
 
     @property
     def strata(self) -> I64:
-        """Index of the site of each data-center week, for the stratified bootstrap, (B,)."""
-        names = list(dict.fromkeys(self.sites))
-        return np.array([names.index(site) for site in self.sites], dtype=np.int64)
+        """Index of site and year of each data-center week, for the bootstrap, (B, 2)."""
+        return strata_of(self.sites, self.years)
 
 
 class Validation(NamedTuple):
@@ -144,9 +145,9 @@ class Evaluation:
 
     rows: pd.DataFrame
     """Table with a row for each controller, training, set of acting agents and data-center week.
-    Its columns are ``controller``, ``training``, ``moves``, ``site``, ``week``, ``figure``,
-    ``valued_figure``, ``idle_figure``, ``achieved_figure``, ``share``, ``broken`` and the names in
-    ``METRICS``."""
+    Its columns are ``controller``, ``training``, ``moves``, ``site``, ``year``, ``week``,
+    ``figure``, ``valued_figure``, ``idle_figure``, ``achieved_figure``, ``share``, ``broken``
+    and the names in ``METRICS``."""
     objective: Objective
     """Objective of the figures."""
     alone: dict[str, F64]
@@ -156,15 +157,28 @@ class Evaluation:
     """Optimal objective of each week if agents do not plan together, (B,), by the names of
     ``optimum.uncoordinated``; empty if it was not computed."""
     strata: I64
-    """Index of the site of each data-center week, (B,)."""
+    """Index of site and year of each data-center week, (B, 2)."""
     missing: tuple[str, ...]
     """Names of the runs that did not finish before ``stop`` returned true."""
+
+
+def strata_of(sites: Iterable[str], years: Iterable[int]) -> I64:
+    """Return the index of site and year of each data-center week, for the bootstrap, (B, 2).
+
+    Args:
+        sites: site of each data-center week, B.
+        years: seed of the synthetic year of each data-center week, B.
+    """
+    pairs = np.array(list(zip(sites, map(str, years), strict=True))).reshape(-1, 2)
+    columns = [np.unique(column, return_inverse=True)[1].reshape(-1) for column in pairs.T]
+    return np.stack(columns, axis=1).astype(np.int64)
 
 
 def prepare(
     configs: Iterable[DataCenterConfig],
     weeks: Sequence[int],
     *,
+    years: Sequence[int] = (),
     objective: Objective | str = "carbon",
     optimum: bool = True,
     exact_ends: bool = False,
@@ -182,6 +196,8 @@ def prepare(
     Args:
         configs: data centers, such as one for each site.
         weeks: weeks of the year, 0..51.
+        years: seeds of the synthetic years of each data center; an empty sequence selects its
+            ``site.seed``.
         objective: objective by which controllers are compared, or its text, such as ``carbon``.
         optimum: whether to compute the optimum, which gives the value of energy and work left at
             the end, and the share of the achievable saving.
@@ -207,7 +223,8 @@ def prepare(
         raise ConfigError(f"evaluation: no {what}; valid is one or more")
     days = whole_number("days", days, UNSCORED_DAYS + 1, DAYS_PER_WEEK)
     aim = Objective.parse(objective) if isinstance(objective, str) else objective
-    sim = Simulator(data_center_weeks(sites, numbers), precision=precision)
+    of_weeks = data_center_weeks(sites, numbers, years)
+    sim = Simulator(of_weeks, precision=precision)
     try:
         per_day = 24 * sim.fleet.steps_per_hour
         steps, scored_from = days * per_day, UNSCORED_DAYS * per_day
@@ -231,8 +248,9 @@ def prepare(
         idle = np.empty(0) if best is None else best.idle
         prepared = DataCenterWeeks(
             sim=sim,
-            sites=tuple(config.name for config in sites for _ in numbers),
-            weeks=numbers * len(sites),
+            sites=tuple(np.repeat([x.name for x in sites], len(of_weeks) // len(sites)).tolist()),
+            years=tuple(config.site.seed for config in of_weeks),
+            weeks=numbers * (len(of_weeks) // len(numbers)),
             objective=aim,
             steps=steps,
             scored_from=scored_from,
@@ -435,6 +453,7 @@ def _rows(
     return pd.DataFrame(
         {
             "site": weeks.sites,
+            "year": weeks.years,
             "week": weeks.weeks,
             "figure": score.figure,
             "valued_figure": valued,

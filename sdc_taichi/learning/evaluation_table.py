@@ -298,7 +298,7 @@ def _base(rows: pd.DataFrame) -> F64:
 
 def _sample(rows: pd.DataFrame, column: str) -> F64:
     """Return a column's values by training and week, (S, W); weeks stay in row order."""
-    width = len(set(zip(rows["site"], rows["week"], strict=True)))
+    width = len(set(zip(rows["site"], rows["year"], rows["week"], strict=True)))
     return rows[column].to_numpy(np.float64).reshape(-1, width)
 
 
@@ -345,6 +345,7 @@ def evaluation_content(
         "objective": str(weeks.objective),
         "unit": weeks.objective.unit,
         "sites": list(dict.fromkeys(weeks.sites)),
+        "years": list(dict.fromkeys(weeks.years)),
         "weeks": list(dict.fromkeys(weeks.weeks)),
         "steps": weeks.steps,
         "scored_from": weeks.scored_from,

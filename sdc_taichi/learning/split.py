@@ -1,9 +1,11 @@
 """Split of the year's weeks into training, validation and held-out weeks.
 
 Agents learn in the training weeks. Validation weeks decide which checkpoint or setting is best.
-Every fourth week is held out for the final results and takes no part in any choice. Forecasts on
-the last day of a week contain data of the next week's first day, so the first day of each week is
-simulated but not scored.
+Held-out weeks are for the final results and take no part in any choice. Each quarter of 13 weeks
+has two of them, in the middle of January, April, July and October, a validation week and eight
+training weeks. A week in no part lies before and after held-out weeks, because weather persists for
+days and forecasts reach into the next day. Forecasts on the last day of a week contain data of the
+next week's first day, so the first day of each week is simulated but not scored.
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ WEEKS = 52
 DAYS_PER_WEEK = 7
 UNSCORED_DAYS = 1
 """Number of days at the beginning of each week that are simulated but not scored."""
-HELD_OUT = tuple(range(3, WEEKS, 4))
+_QUARTERS = range(0, WEEKS, 13)
+HELD_OUT = tuple(first + week for first in _QUARTERS for week in (2, 3))
 """Test weeks of the year, 0..51, in which results are reported."""
-VALIDATION = tuple(range(1, WEEKS, 8))
+VALIDATION = tuple(first + 5 for first in _QUARTERS)
 """Weeks of the year, 0..51, by which checkpoints and settings are chosen."""
-TRAINING = tuple(week for week in range(WEEKS) if week not in {*HELD_OUT, *VALIDATION})
+TRAINING = tuple(first + week for first in _QUARTERS for week in (0, *range(6, 13)))
 """Weeks of the year, 0..51, in which agents learn."""
 NAMED_WEEKS: Mapping[str, tuple[int, ...]] = {
     "held-out": HELD_OUT,
@@ -60,24 +63,37 @@ def first_day(week: int) -> str:
 
 
 def data_center_weeks(
-    configs: Iterable[DataCenterConfig], weeks: Sequence[int]
+    configs: Iterable[DataCenterConfig], weeks: Sequence[int], years: Sequence[int] = ()
 ) -> list[DataCenterConfig]:
-    """Return a copy of each data center for each week, named ``NAME-WEEK``.
+    """Return a copy of each data center for each year and week, named ``NAME-WEEK``.
+
+    A data center is sized for its year, so copies in different years differ a little in size.
 
     Args:
         configs: the data centers, such as one for each site.
         weeks: weeks of the year, 0..51, in which the copies begin.
+        years: seeds of the synthetic years; the name of a copy is then ``NAME-YEAR-WEEK``. An empty
+            sequence selects ``site.seed`` of each data center.
 
     Returns:
-        All weeks of the first data center, then all weeks of the second, and so on.
+        All years of the first data center, then all years of the second, and so on, with all weeks
+        of each year one after another.
     """
     return [
-        config.model_copy(
-            update={
-                "name": f"{config.name}-{week}",
-                "site": config.site.model_copy(update={"start": first_day(week)}),
-            }
-        )
+        of_week(config if year is None else in_year(config, year), week)
         for config in configs
+        for year in years or (None,)
         for week in weeks
     ]
+
+
+def of_week(config: DataCenterConfig, week: int) -> DataCenterConfig:
+    """Return a copy of a data center that begins in a week of the year, 0..51."""
+    site = config.site.model_copy(update={"start": first_day(week)})
+    return config.model_copy(update={"name": f"{config.name}-{week}", "site": site})
+
+
+def in_year(config: DataCenterConfig, year: int) -> DataCenterConfig:
+    """Return a copy of a data center in the synthetic year with a seed."""
+    site = config.site.model_copy(update={"seed": year})
+    return config.model_copy(update={"name": f"{config.name}-{year}", "site": site})

@@ -2,10 +2,10 @@
 
 A sample is an array of objective values, shape (S, W), for S trainings (seeds) and W data-center
 weeks; S is 1 for a controller without training. Intervals come from a bootstrap (Efron 1979) that
-resamples whole trainings, and weeks within each site. The same weeks are drawn for all samples, so
-that differences are paired. Interquartile mean, probability of improvement and performance profiles
-follow Agarwal et al. (2021, "Deep reinforcement learning at the edge of the statistical precipice",
-NeurIPS 34).
+resamples whole trainings, sites, years within each site, and weeks within each year. The same weeks
+are drawn for all samples, so that differences are paired. Interquartile mean, probability of
+improvement and performance profiles follow Agarwal et al. (2021, "Deep reinforcement
+learning at the edge of the statistical precipice", NeurIPS 34).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def bootstrap_interval(
     Args:
         statistic: function of the samples.
         samples: samples that share their weeks, (S, W) each; S may differ between samples.
-        strata: stratum of each week, (W,); weeks are resampled within their stratum.
+        strata: index of site and of year of each week, (W, 2), as for ``drawn_weeks``.
         generator: random generator of the bootstrap.
         draws: number of bootstrap resamples.
         level: confidence level, 0..1.
@@ -206,15 +206,38 @@ def performance_profile(scores: F64, thresholds: F64) -> F64:
 
 
 def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int = DRAWS) -> I64:
-    """Return indices of weeks, drawn with replacement within each stratum, (draws, W).
+    """Return indices of weeks, drawn with replacement level by level, (draws, W).
+
+    Each site is replaced by a random site, each of its years by a random year of the drawn site,
+    and each of its weeks by a random week of the drawn year.
 
     Args:
-        strata: stratum of each week, (W,).
+        strata: index of site and of year of each week, (W, 2).
         generator: random generator of the bootstrap.
         draws: number of bootstrap resamples.
     """
-    weeks = np.empty((draws, len(strata)), dtype=np.int64)
-    for stratum in np.unique(strata):
-        numbers = np.flatnonzero(strata == stratum)
-        weeks[:, numbers] = generator.choice(numbers, size=(draws, len(numbers)))
-    return weeks
+    years, year_of_week = np.unique(strata, axis=0, return_inverse=True)
+    year_of_week = year_of_week.reshape(-1)
+    sites, site_of_year = np.unique(years[:, 0], return_inverse=True)
+    site_of_site = np.zeros(len(sites), dtype=np.int64)
+    drawn_sites = _drawn(site_of_site, site_of_site[None], generator, draws)
+    drawn_years = _drawn(site_of_year, drawn_sites[:, site_of_year], generator, draws)
+    return _drawn(year_of_week, drawn_years[:, year_of_week], generator, draws)
+
+
+def _drawn(parents: I64, drawn: I64, generator: np.random.Generator, draws: int) -> I64:
+    """Return a random child of the drawn parent of each child.
+
+    Args:
+        parents: parent of each of the C children, (C,).
+        drawn: parent that is drawn in place of that of each child, (draws or 1, C).
+        generator: random generator.
+        draws: number of resamples.
+
+    Returns:
+        Index of a child, (draws, C).
+    """
+    order, counts = np.argsort(parents, kind="stable"), np.bincount(parents)
+    first = np.cumsum(counts) - counts
+    places = generator.random((draws, len(parents)))
+    return np.asarray(order[first[drawn] + (places * counts[drawn]).astype(np.int64)])

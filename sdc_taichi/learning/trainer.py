@@ -232,6 +232,7 @@ class _Run:
             weeks = prepare(
                 settings.data_centers_of_sites(),
                 VALIDATION if validation.weeks == "validation" else validation.weeks,
+                years=validation.years,
                 objective=validation.objective,
                 optimum=validation.optimum,
                 days=validation.days,

@@ -43,6 +43,8 @@ from sdc_taichi.learning.split import (
     VALIDATION,
     WEEKS,
     data_center_weeks,
+    in_year,
+    of_week,
 )
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet_configs import make_configs
@@ -183,6 +185,8 @@ MOST_STEPS = 10**12
 """Maximum number of steps of a training; even the fastest machine would take years for it."""
 Week = Annotated[int, Field(strict=True, ge=0, lt=WEEKS)]
 """Week of the year, 0..51."""
+Year = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+"""Seed of a synthetic year, 0..2^31 - 1."""
 _FIXED_BY_WEEKS = ("start", "months")
 
 Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
@@ -196,7 +200,10 @@ class ValidationSettings(Section):
     """Number of steps between two validations, summed over all data centers, 0..1e12; 0 disables
     validation."""
     weeks: Literal["validation"] | tuple[Week, ...] = "validation"
-    """Weeks of the year, 0..51; ``validation`` stands for weeks 1, 9, ..., 49."""
+    """Weeks of the year, 0..51; ``validation`` stands for weeks 5, 18, 31 and 44."""
+    years: tuple[Year, ...] = ()
+    """Seeds of the synthetic years of each data center; an empty list selects that of the
+    configuration."""
     days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
     """Number of days simulated in each week, 2..7; the first day is not scored."""
     objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
@@ -211,6 +218,11 @@ class ValidationSettings(Section):
     @classmethod
     def _each_week_once(cls, value: Any) -> Any:
         return _weeks_once(value)
+
+    @field_validator("years")
+    @classmethod
+    def _each_year_once(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        return _years_once(value)
 
 
 class TrainingSettings(Section):
@@ -232,6 +244,9 @@ class TrainingSettings(Section):
     """Weeks of the year, 0..51, in which episodes begin, with one data center for each site and
     week. ``training`` stands for all weeks that are neither held out nor used for validation. None
     takes the first days of episodes from ``environment``."""
+    years: tuple[Year, ...] = ()
+    """Seeds of synthetic years. Each pair of site and week is in one of them, the pairs in turn. An
+    empty list selects the year of the configuration."""
     data_centers: Annotated[int, Field(strict=True, ge=1, le=1_000_000)] | None = None
     """Number of data centers that are simulated at once. The pairs of site and week are assigned to
     them in turn. None selects the smallest multiple of the number of pairs that is at least 256."""
@@ -307,6 +322,13 @@ class TrainingSettings(Section):
     def _each_week_once(cls, value: Any) -> Any:
         return _weeks_once(value)
 
+    @field_validator("years")
+    @classmethod
+    def _each_year_once(cls, value: tuple[int, ...], info: Any) -> Any:
+        if value and info.data.get("weeks", ()) is None:
+            raise ValueError("without effect with weeks null; valid is environment.years")
+        return _years_once(value)
+
     @field_validator("learning", mode="before")
     @classmethod
     def _of_the_algorithm(cls, value: Any, info: Any) -> Any:
@@ -366,9 +388,12 @@ class TrainingSettings(Section):
 
     def to_yaml(self) -> str:
         """Return the settings as YAML text, from which ``load_settings`` reads equal settings."""
-        # Fingerprints of trainings before this setting do not contain it.
-        unset = None if self.own_policies else {"own_policies"}
-        return yaml.safe_dump(self.model_dump(mode="json", exclude=unset), sort_keys=False)
+        # Fingerprints of trainings before these settings do not contain them.
+        unset = {name for name in ("own_policies", "years") if not getattr(self, name)}
+        values = self.model_dump(mode="json", exclude=unset)
+        if not self.validation.years:
+            del values["validation"]["years"]
+        return yaml.safe_dump(values, sort_keys=False)
 
     def options(self) -> EnvOptions:
         """Return the options of the environments; if ``weeks`` is set, first days are fixed."""
@@ -394,7 +419,15 @@ class TrainingSettings(Section):
             configs = [self._config()]
         if self.weeks is None:
             return configs
-        return data_center_weeks(configs, TRAINING if self.weeks == "training" else self.weeks)
+        weeks = TRAINING if self.weeks == "training" else self.weeks
+        if not self.years:
+            return data_center_weeks(configs, weeks)
+        # Each year has as many weeks of each site, spread over the year.
+        return [
+            of_week(in_year(config, self.years[(site + at) % len(self.years)]), week)
+            for site, config in enumerate(configs)
+            for at, week in enumerate(weeks)
+        ]
 
     def data_centers_of_sites(self) -> list[DataCenterConfig]:
         """Return one data center for each site; without ``sites``, that of the configuration.
@@ -409,8 +442,9 @@ class TrainingSettings(Section):
 
     def validation_weeks(self) -> int:
         """Return the number of validation weeks of all sites together."""
-        weeks = self.validation.weeks
-        return max(len(self.sites), 1) * len(VALIDATION if weeks == "validation" else weeks)
+        weeks, years = self.validation.weeks, self.validation.years
+        number = len(VALIDATION if weeks == "validation" else weeks)
+        return max(len(self.sites), 1) * max(len(years), 1) * number
 
     def difference(self, other: TrainingSettings) -> str | None:
         """Describe the first setting that differs, ignoring ``steps``; None if all are equal.
@@ -482,6 +516,13 @@ def read_values(path: str | os.PathLike[str], *, allow_code: bool = False) -> di
         )
     check_file_names(values, path, is_path=is_path, allow_code=allow_code)
     return values
+
+
+def _years_once(value: tuple[int, ...]) -> tuple[int, ...]:
+    """Check that a tuple of years has no duplicates; return it."""
+    if len(set(value)) < len(value):
+        raise ValueError(f"{list(value)}; valid is each year once")
+    return value
 
 
 def _weeks_once(value: Any) -> Any:
