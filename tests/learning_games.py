@@ -131,6 +131,17 @@ class Coordination(Game):
         return self.rewards[actions[:, 0], actions[:, 1]], room
 
 
+class Temptation(Game):
+    """Each choice pays its player as much as it is high, and costs the other player twice that."""
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        choices = actions.float()
+        return choices - 2.0 * choices.flip(1), room
+
+    def pay(self, player: int, pay: Tensor) -> Tensor:
+        return pay[:, player]
+
+
 class Patience(Game):
     """Choice 0 pays 1 at once; choice 2 pays nothing, and leads to a room where any pays 3."""
 

@@ -20,6 +20,7 @@ from learning_games import (  # noqa: E402
     Meeting,
     Patience,
     Rooms,
+    Temptation,
     assert_same_bits,
     chosen,
     weights,
@@ -68,6 +69,15 @@ def test_players_find_the_best_choices(names: tuple[str, ...], game: Game, best:
         played = copy.deepcopy(game)
         learner = trained(name, played, 30 if name in ON_POLICY else 100)
         assert chosen(learner, torch.eye(game.rooms)[0]) == best, name
+
+
+@pytest.mark.parametrize("name", [name for name in SETTINGS if name != "ppo"])
+def test_players_learn_from_their_own_reward_that_of_the_team_or_a_mixture(name: str) -> None:
+    # A higher choice gains 1 of the own reward, and loses 1/2 of the mean reward of the team.
+    for reward, best in (("own", 2.0), ("team", 0.0), (0.8, 2.0), (0.1, 0.0)):
+        updates = 20 if name in ON_POLICY else 60
+        learner = trained(name, Temptation(2), updates, reward=reward)
+        assert chosen(learner, torch.ones(1)) == [best, best], reward
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_the_density_of_squashed_numbers_integrates_to_one() -> None:
 def test_each_choice_is_the_best_reply_to_those_before_it() -> None:
     table = Coordination.rewards.flatten()[None]
     choices = torch.tensor([[2, 2]])
-    first, second = best_replies(table, choices, [0, 1], 3)[0]
+    first, second = best_replies({0: table, 1: table}, choices, 3)[0]
     assert first.tolist() == [4.0, 2.0, 3.0]
     assert second.tolist() == [5.0, -3.0, 4.0]  # the first has moved to 0
 
@@ -81,7 +81,7 @@ def filled_replay(
     replay = Replay(2 * rows, 2, 1, 1, steps=n_steps, discount=0.5)
     for t in range(steps):
         at = torch.tensor([[10.0 * t], [10.0 * t + 1]])
-        replay.add(at, at, torch.ones(2))
+        replay.add(at, at, torch.ones(2, 1))
         if t in ends:
             replay.end(at + 10.0)
     return replay
@@ -89,7 +89,13 @@ def filled_replay(
 
 def drawn_from(replay: Replay) -> set[tuple[float, ...]]:
     drawn = replay.sample(400, torch.Generator().manual_seed(0))
-    columns = drawn.before[:, 0], drawn.actions[:, 0], drawn.steps, drawn.returns, drawn.after[:, 0]
+    columns = (
+        drawn.before[:, 0],
+        drawn.actions[:, 0],
+        drawn.steps,
+        drawn.returns[0],
+        drawn.after[:, 0],
+    )
     return set(zip(*(x.tolist() for x in columns), strict=True))
 
 
@@ -127,7 +133,7 @@ def test_a_replay_too_small_for_its_transitions_is_refused() -> None:
 def test_temperatures_rise_below_the_wanted_entropy_and_fall_above_it() -> None:
     game: Any = Aim(players=2, discrete=False)
     critic = ContinuousValues(1, 1, 2, SMALL, torch.Generator())
-    actors = GaussianActors(critic, game.spaces, SMALL, torch.Generator())
+    actors = GaussianActors(critic, game.spaces, SMALL, 1, torch.Generator())
     for name, entropy in zip(game.spaces, (-1.1, -0.9), strict=True):
         loss = actors.nets[name](torch.ones(1, 1)).sum()
         actors._step(name, loss, torch.tensor(entropy))

@@ -105,6 +105,8 @@ def test_difference_names_the_setting_and_both_values() -> None:
         ({"scenario": ["carbon"]}, "scenario: should be a text"),
         ({"algoritm": "happo"}, "algoritm: unknown key; did you mean 'algorithm'"),
         ({"learning": {"epoch": 1}}, "settings of happo: epoch: unknown key; did you mean 'epochs"),
+        ({"learning": {"reward": "onw"}}, "reward: should be 'own' or 'team' or .* number"),
+        ({"algorithm": "ppo", "learning": {"reward": 0.5}}, "ppo has one learner .* valid is team"),
         ({"learning": {"discount": 2}}, "discount: should be less than or equal to 1"),
         ({"steps": 1.5}, "steps: .* valid integer"),
         ({"sites": ["NY", "ny"]}, r"sites: .* valid is each site once"),

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 Share = Annotated[float, Field(ge=0, le=1)]
+Reward = Literal["own", "team"] | Share
 Hidden = tuple[Annotated[int, Field(strict=True, ge=1, le=4096)], ...]
 
 
@@ -28,6 +29,10 @@ class LearningSettings(BaseModel):
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 7
     """Number of equally spaced levels from -1 to 1 that a continuous action is chosen from (Tang
     and Agrawal 2020); None allows any number."""
+    reward: Reward | None = None
+    """Reward that learners learn from: ``own``, the reward of each learner; ``team``, the mean
+    reward of all learning agents; or a mixture of both, as the share of the own reward, 0..1. None
+    selects the default of the algorithm."""
 
     def steps_per_update(self, episode_steps: int) -> int:
         """Return the number of steps of each data center between two updates.
@@ -78,9 +83,6 @@ class OnPolicySettings(ActingSettings):
     """Number of units in each hidden layer of policies and critics."""
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation function of all layers except the last."""
-    reward: Literal["own", "team"] | None = None
-    """Reward that critics learn: ``own`` is the reward of each learner, ``team`` the mean reward of
-    all learning agents; None selects the one in the publication of the algorithm."""
     critic: Literal["observation", "state"] | None = None
     """Input of critics: the observation of their learner, or the shared state; None selects the
     one in the publication of the algorithm."""
@@ -161,8 +163,8 @@ class OnPolicyDefinition(NamedTuple):
 
     critic: Literal["observation", "state"]
     """Input of critics: the observation of each learner, or the shared state."""
-    reward: Literal["own", "team"]
-    """Reward that critics learn: the reward of each learner, or the mean reward of the team."""
+    reward: Reward
+    """Reward that critics learn by default."""
     sequential: bool
     """True if learners are updated one after another in random order, with advantages weighted by
     the probability ratios of the learners that were updated before."""
@@ -173,6 +175,8 @@ class OnPolicyDefinition(NamedTuple):
 class OffPolicyDefinition(NamedTuple):
     """Properties in which the off-policy algorithms differ."""
 
+    reward: Reward
+    """Reward that critics learn by default."""
     critics: int
     """Number of critics; the minimum of their values is used."""
     soft: bool
@@ -181,7 +185,7 @@ class OffPolicyDefinition(NamedTuple):
 
 
 ON_POLICY: dict[str, OnPolicyDefinition] = {
-    "ppo": OnPolicyDefinition(critic="observation", reward="own", sequential=False, clips=True),
+    "ppo": OnPolicyDefinition(critic="observation", reward="team", sequential=False, clips=True),
     "ippo": OnPolicyDefinition(critic="observation", reward="own", sequential=False, clips=True),
     "mappo": OnPolicyDefinition(critic="state", reward="team", sequential=False, clips=True),
     "happo": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=True),
@@ -189,8 +193,8 @@ ON_POLICY: dict[str, OnPolicyDefinition] = {
 }
 """On-policy algorithms, which learn from the steps of their current policies, by name."""
 OFF_POLICY: dict[str, OffPolicyDefinition] = {
-    "had3qn": OffPolicyDefinition(critics=1, soft=False),
-    "hasac": OffPolicyDefinition(critics=2, soft=True),
+    "had3qn": OffPolicyDefinition(reward="team", critics=1, soft=False),
+    "hasac": OffPolicyDefinition(reward="team", critics=2, soft=True),
 }
 """Off-policy algorithms, which learn from the steps in a replay buffer, by name."""
 LEARNING_SETTINGS: dict[str, type[LearningSettings]] = {
@@ -199,6 +203,19 @@ LEARNING_SETTINGS: dict[str, type[LearningSettings]] = {
     "cross-entropy": CrossEntropySettings,
 }
 """Class of the settings of each algorithm, by name."""
+
+
+def own_share(reward: Reward | None, default: Reward) -> float:
+    """Return the share of the own reward in the reward that learners learn from, 0..1.
+
+    Args:
+        reward: setting ``reward``.
+        default: reward that None selects.
+    """
+    chosen = default if reward is None else reward
+    if isinstance(chosen, str):
+        return 1.0 if chosen == "own" else 0.0
+    return chosen
 
 
 def uses_state(name: str, settings: LearningSettings) -> bool:

@@ -23,10 +23,10 @@ import numpy as np
 import torch
 
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.algorithms import CrossEntropySettings
+from sdc_taichi.learning.algorithms import CrossEntropySettings, own_share
 from sdc_taichi.learning.networks import CLIP, LEAST_STD, policy_network
 from sdc_taichi.learning.policy import PolicyNetwork
-from sdc_taichi.learning.stream import EnvironmentStream
+from sdc_taichi.learning.stream import EnvironmentStream, learned_rewards
 from sdc_taichi.types import F32, F64, I64
 
 LEAST_SPREAD = 1e-9
@@ -111,16 +111,14 @@ class CrossEntropySearch:
         """
         drawn = {name: self._draw(search) for name, search in self._searches.items()}
         tried = {name: self._shuffled() for name in self._searches}
-        returns = self._try(stream, drawn, tried)
+        returns, logged = self._try(stream, drawn, tried)
         self._done += 1
-        logged: dict[str, float] = {}
         for name, search in self._searches.items():
             if self._done > 1:
                 figures = _figures(returns[name], search)
                 mean_figures = np.bincount(tried[name], figures) / np.bincount(tried[name])
                 self._select(search, drawn[name], mean_figures)
             self._remember(search, returns[name])
-            logged[f"reward/{name}"] = float(returns[name].mean()) / stream.episode_steps
             logged[f"spread/{name}"] = float(search.std.mean())
         return logged
 
@@ -166,15 +164,17 @@ class CrossEntropySearch:
 
     def _try(
         self, stream: EnvironmentStream, drawn: Mapping[str, F64], tried: Mapping[str, I64]
-    ) -> dict[str, F64]:
-        """Run an episode and return the returns by learner, (B,) each.
+    ) -> tuple[dict[str, F64], dict[str, float]]:
+        """Run an episode; return the returns by learner, (B,) each, and mean rewards to log.
 
         The first episode also measures mean and standard deviation of the observations.
         """
         parameters = {name: drawn[name][tried[name]].astype(np.float32) for name in drawn}
         returns = {name: np.zeros(self._size) for name in drawn}
+        own = own_share(self._settings.reward, "own")
         sums = {name: np.zeros((2, s.seen_mean.size)) for name, s in self._searches.items()}
         counts, ended = dict.fromkeys(drawn, 0), False
+        logged = {f"reward/{name}": 0.0 for name in drawn}
         while not ended:
             actions = {}
             for name, search in self._searches.items():
@@ -189,13 +189,14 @@ class CrossEntropySearch:
             after = stream.step(actions)
             ended = after.ended
             for name, reward in after.mean_rewards.items():
-                returns[name] += reward.numpy()
+                logged[f"reward/{name}"] += float(reward.mean()) / stream.episode_steps
+                returns[name] += learned_rewards(reward, after.team, own).numpy()
         if not self._done:
             for name, search in self._searches.items():
                 mean, square = sums[name] / max(counts[name], 1)
                 search.seen_mean = mean
                 search.seen_std = np.sqrt(np.maximum(square - mean * mean, LEAST_STD**2))
-        return returns
+        return returns, logged
 
     def _select(self, search: _Search, drawn: F64, figures: F64) -> None:
         """Fit the distributions to the best candidates, and widen them by the current noise."""

@@ -6,9 +6,11 @@ all learners, are fitted by Adam to the targets
 
     y = r_0 + ... + gamma^(n-1) r_(n-1) + gamma^n V(s_n),
 
-where r is the reward of the team and V comes from target critics (slowly updated copies). Episodes
-are truncated, never terminated, so V is also added at the end of an episode. The learners are
-updated one after another in random order. The algorithms differ in V and in that update:
+where r is the reward of the team and V comes from target critics (slowly updated copies). If the
+learners have own rewards, each learner has E critics of its own reward in place of that of the
+team. Episodes are truncated, never terminated, so V is also added at the end of an episode. The
+learners are updated one after another in random order. The algorithms differ in V and in that
+update:
 
 - ``had3qn`` (Zhong et al. 2024) has one dueling critic (Wang et al. 2016). Each learner has its own
   action values, which are fitted to the critic's. The learners' values select the best actions, and
@@ -36,7 +38,7 @@ import torch
 from torch import Tensor
 
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.algorithms import OffPolicyDefinition, OffPolicySettings
+from sdc_taichi.learning.algorithms import OffPolicyDefinition, OffPolicySettings, own_share
 from sdc_taichi.learning.networks import (
     ContinuousValues,
     JointValues,
@@ -54,7 +56,12 @@ from sdc_taichi.learning.off_policy_actors import (
     descend,
 )
 from sdc_taichi.learning.policy import PolicyNetwork
-from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
+from sdc_taichi.learning.stream import (
+    EnvironmentStream,
+    LearnerSpaces,
+    StreamStep,
+    learned_rewards,
+)
 
 STATE = "state"
 """Name of the columns that hold the shared state."""
@@ -92,8 +99,15 @@ class OffPolicy:
         self._columns = _columns(self._spaces, stream.state_width)
         self._numbers = _numbers(self._spaces)
         self._soft = definition.soft
+        self._own_share = own_share(settings.reward, definition.reward)
+        rewards = len(self._spaces) if self._own_share else 1
         self._critic, self._actors = _critic_and_actors(
-            definition, settings, self._spaces, stream.state_width, self._generators["weights"]
+            definition,
+            settings,
+            self._spaces,
+            stream.state_width,
+            rewards,
+            self._generators["weights"],
         )
         self._targets = [x.detach().clone() for x in self._critic.parameters]
         self._adam = adam(self._critic.parameters, settings.rate)
@@ -105,9 +119,9 @@ class OffPolicy:
             for name, of in self._spaces.items()
             if _has_rows(of)
         }
-        self._rewards = RunningMoments(1)
-        self._returns = RunningMoments(1)
-        self._running_return = torch.zeros(0)
+        self._rewards = RunningMoments(rewards)
+        self._returns = RunningMoments(rewards)
+        self._running_return = torch.zeros(0, rewards)
         self._replay: Replay | None = None
 
     @property
@@ -198,6 +212,7 @@ class OffPolicy:
             num_envs,
             max(part.stop for part in self._columns.values()),
             self._numbers,
+            len(self._rewards.mean),
             steps=self._settings.n_steps,
             discount=self._settings.discount,
         )
@@ -221,9 +236,9 @@ class OffPolicy:
                         for name, part in self._actors.numbers.items()
                     }
                 )
-                reward = after.team
-                replay.add(before, actions, reward)
-                self._measure(reward)
+                learned = self._learned(after)
+                replay.add(before, actions, learned)
+                self._measure(learned)
                 if after.ended:
                     ends = after.next_state, after.next_observations, after.next_masks
                     replay.end(self._joined(*ends))
@@ -240,14 +255,26 @@ class OffPolicy:
         logged = {f"reward/{n}": float(x) / steps for n, x in rewards.items()}
         return logged if self._soft else logged | {"exploration": self.exploration}
 
-    def _measure(self, reward: Tensor) -> None:
-        """Update the running moments of rewards and returns with the reward of a step, (B,)."""
-        self._rewards.add(reward.unsqueeze(-1))
+    def _learned(self, after: StreamStep) -> Tensor:
+        """Return the rewards that the critics learn, (B, Z): of each learner, or of the team."""
+        if not self._own_share:
+            return after.team[:, None]
+        return torch.stack(
+            [
+                learned_rewards(after.mean_rewards[name], after.team, self._own_share)
+                for name in self._spaces
+            ],
+            dim=1,
+        )
+
+    def _measure(self, rewards: Tensor) -> None:
+        """Update the running moments of rewards and returns with the rewards of a step, (B, Z)."""
+        self._rewards.add(rewards)
         if not len(self._running_return):
-            self._running_return = torch.zeros_like(reward)
-        above = reward - self._rewards.mean.float()
+            self._running_return = torch.zeros_like(rewards)
+        above = rewards - self._rewards.mean.float()
         self._running_return = self._settings.discount * self._running_return + above
-        self._returns.add(self._running_return.unsqueeze(-1))
+        self._returns.add(self._running_return)
 
     def _situation(self, columns: Tensor) -> Situation:
         """Split the columns from ``_joined``, (N, width), and normalise states and observations."""
@@ -300,7 +327,7 @@ class OffPolicy:
         return {"critic_loss": loss.detach(), **logged}
 
     def _critic_targets(self, drawn: Transitions, after: Situation) -> Tensor:
-        """Return the targets y of the critics, (N,).
+        """Return the targets y of the critics, (Z, N).
 
         The mean reward is subtracted from every reward; this changes no optimal policy because
         episodes never terminate. The returns are then divided by the standard deviation of
@@ -310,7 +337,8 @@ class OffPolicy:
         later = discount**drawn.steps
         terms = (1.0 - later) / (1.0 - discount) if discount < 1.0 else drawn.steps
         scale = self._returns.variance.sqrt().clamp_min(LEAST_SCALE).float()
-        returns = (drawn.returns - terms * self._rewards.mean.float()) / scale
+        means = self._rewards.mean.float()[:, None]
+        returns = (drawn.returns - terms * means) / scale[:, None]
         generator = self._generators["order"]
         return returns + later * self._actors.next_values(self._targets, after, generator)
 
@@ -319,10 +347,11 @@ def critic_loss(values: Tensor, targets: Tensor) -> Tensor:
     """Return half the mean squared error of the values, summed over the critics.
 
     Args:
-        values: values of each of the E critics for N transitions, (E, N).
-        targets: target of each transition, (N,).
+        values: values of N transitions, (Z E, N), of E critics of each of Z rewards.
+        targets: targets of each reward, (Z, N).
     """
-    return 0.5 * (values - targets).square().mean(-1).sum()
+    errors = values.unflatten(0, (len(targets), -1)) - targets[:, None]
+    return 0.5 * errors.square().mean(-1).sum()
 
 
 def _columns(spaces: Mapping[str, LearnerSpaces], state_width: int) -> dict[str, slice]:
@@ -360,21 +389,22 @@ def _critic_and_actors(
     settings: OffPolicySettings,
     spaces: Mapping[str, LearnerSpaces],
     state_width: int,
+    rewards: int,
     generator: torch.Generator,
 ) -> tuple[JointValues | ContinuousValues, GreedyActors | SoftActors | GaussianActors]:
-    """Return the critics, and the policies that learn from them."""
-    shape = definition.critics, state_width, _numbers(spaces), settings, generator
+    """Return the critics of each of Z rewards, and the policies that learn from them."""
+    shape = rewards * definition.critics, state_width, _numbers(spaces), settings, generator
     levels = next(iter(spaces.values())).choices
     if levels is not None:
         table = JointValues(*shape, levels)
         kind = SoftActors if definition.soft else GreedyActors
-        return table, kind(table, spaces, settings, generator)
+        return table, kind(table, spaces, settings, rewards, generator)
     if not definition.soft:
         raise ConfigError(
             "had3qn: learns choices alone; valid is discrete actions, or levels of continuous ones"
         )
     critic = ContinuousValues(*shape)
-    return critic, GaussianActors(critic, spaces, settings, generator)
+    return critic, GaussianActors(critic, spaces, settings, rewards, generator)
 
 
 class Transitions(NamedTuple):
@@ -385,7 +415,7 @@ class Transitions(NamedTuple):
     actions: Tensor
     """Actions of the first step, (N, actions)."""
     returns: Tensor
-    """Discounted sum of the rewards of a transition's steps, (N,)."""
+    """Discounted sums of each of the Z rewards of a transition's steps, (Z, N)."""
     steps: Tensor
     """Number of steps of each transition, at least 1, (N,)."""
     after: Tensor
@@ -405,6 +435,7 @@ class Replay:
         num_envs: number of environments, B.
         width: number of entries of a situation.
         actions: number of actions in each step.
+        rewards: number of rewards in each step, Z.
         steps: maximum number n of steps of a transition.
         discount: discount factor per step.
 
@@ -417,7 +448,15 @@ class Replay:
     """
 
     def __init__(
-        self, size: int, num_envs: int, width: int, actions: int, *, steps: int, discount: float
+        self,
+        size: int,
+        num_envs: int,
+        width: int,
+        actions: int,
+        rewards: int = 1,
+        *,
+        steps: int,
+        discount: float,
     ) -> None:
         self.rows, self.num_envs = size // num_envs, num_envs
         least = steps + 2
@@ -426,9 +465,14 @@ class Replay:
                 f"learning.replay_size {size}: holds {self.rows} steps of {num_envs} data centers; "
                 f"valid is at least {least * num_envs}"
             )
-        self._width, self._steps, self._discount = width, steps, discount
-        # Situation, actions and reward are adjacent in memory, so that a draw makes one access.
-        self._data = torch.empty(self.rows, num_envs, width + actions + 1)
+        self._width, self._paid, self._steps, self._discount = (
+            width,
+            width + actions,
+            steps,
+            discount,
+        )
+        # Situation, actions and rewards are adjacent in memory, so that a draw makes one access.
+        self._data = torch.empty(self.rows, num_envs, self._paid + rewards)
         self._is_end = torch.zeros(self.rows, dtype=torch.bool)
         self._count = 0
         self._starts: Tensor | None = None
@@ -445,12 +489,12 @@ class Replay:
         Args:
             situations: situations before the step, (B, width).
             actions: actions of the step, (B, actions).
-            rewards: rewards of the step, (B,).
+            rewards: rewards of the step, (B, Z).
         """
         row = self._next_row(is_end=False)
         row[:, : self._width] = situations
-        row[:, self._width : -1] = actions
-        row[:, -1] = rewards
+        row[:, self._width : self._paid] = actions
+        row[:, self._paid :] = rewards
 
     def end(self, situations: Tensor) -> None:
         """Append the situations at the end of the episodes, (B, width)."""
@@ -482,13 +526,13 @@ class Replay:
         first = data.index_select(0, at * self.num_envs + environment)
         later = (at + span) % self.rows * self.num_envs + environment
         after = data.index_select(0, later)[:, : self._width]
-        returns = first[:, -1].clone()
+        returns = first[:, self._paid :].T.clone()
         for step in range(1, self._steps):
             row = (at + step) % self.rows
-            reward = data[row * self.num_envs + environment, -1]
-            returns += torch.where(step < span, self._discount**step * reward, 0.0)
+            rewards = data[row * self.num_envs + environment, self._paid :].T
+            returns += torch.where(step < span, self._discount**step * rewards, 0.0)
         return Transitions(
-            first[:, : self._width], first[:, self._width : -1], returns, span, after
+            first[:, : self._width], first[:, self._width : self._paid], returns, span, after
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -7,7 +7,9 @@ two learners respond to the same possible improvement.
 In shapes, N is the batch size, K the number of actions of all agents together, k the number of
 one learner's actions, and L the number of levels of a discrete action. If W agents share the policy
 of a learner, k is the number of all their actions. Agents without effect have constant actions, the
-first level or 0, so that they add nothing to losses and gradients.
+first level or 0, so that they add nothing to losses and gradients. Z is the number of rewards: 1 if
+all learners have the reward of the team, or else one for each learner. E is the number of critics
+of each reward.
 """
 
 from __future__ import annotations
@@ -72,6 +74,7 @@ class Actors(Generic[Values]):
         critic: critic that the policies learn from.
         spaces: sizes of the observations and actions of each learner.
         settings: settings of the algorithm.
+        rewards: number of rewards that the critic values, Z.
         generator: random generator of the initial weights.
 
     Attributes:
@@ -85,9 +88,11 @@ class Actors(Generic[Values]):
         critic: Values,
         spaces: Mapping[str, LearnerSpaces],
         settings: OffPolicySettings,
+        rewards: int,
         generator: torch.Generator,
     ) -> None:
-        self._critic, self._settings = critic, settings
+        self._critic, self._settings, self._rewards = critic, settings, rewards
+        self._reward_of = {name: i if rewards > 1 else 0 for i, name in enumerate(spaces)}
         self._outputs = next(iter(spaces.values())).choices or 2
         self.nets: dict[str, nn.Sequential] = {}
         self.numbers: dict[str, slice] = {}
@@ -138,6 +143,10 @@ class Actors(Generic[Values]):
         first_level[0] = 0.0
         return torch.where(acting[..., None], scores, first_level)
 
+    def _least(self, values: Tensor) -> Tensor:
+        """Return the least value of the critics of each reward, (Z, N, ...), from (Z E, N, ...)."""
+        return values.unflatten(0, (self._rewards, -1)).amin(1)
+
     def _descend(self, loss: Tensor, name: str) -> None:
         """Take a gradient step of a learner's network."""
         descend(
@@ -181,25 +190,25 @@ class GreedyActors(Actors[JointValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
     ) -> Tensor:
-        """Return the target critic's values of the learners' best choices, (N,).
+        """Return the target critic's values of the learners' best choices, (Z, N).
 
         Selection by the learners and evaluation by the critic is double Q-learning (van Hasselt et
         al. 2016).
         """
         best = self._choice_outputs(after).argmax(-1)
-        return self._critic.of_actions(after.state, best, targets).amin(0)
+        return self._least(self._critic.of_actions(after.state, best, targets))
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Fit each learner's action values to the critic's table; return the losses by learner."""
         outputs = self._choice_outputs(situation)
         with torch.no_grad():
-            table = self._critic(situation.state).amin(0)
-            order = [
-                number
+            tables = self._least(self._critic(situation.state))
+            order = {
+                number: tables[self._reward_of[name]]
                 for name in self._order(generator)
                 for number in range(*self.numbers[name].indices(outputs.shape[1]))
-            ]
-            rows = best_replies(table, outputs.argmax(-1), order, self._outputs)
+            }
+            rows = best_replies(order, outputs.argmax(-1), self._outputs)
             rows -= rows.mean(-1, keepdim=True)
         losses = {}
         for name, numbers in self.numbers.items():
@@ -221,6 +230,7 @@ class EntropicActors(Actors[Values]):
         critic: critic that the policies learn from.
         spaces: sizes of the observations and actions of each learner.
         settings: settings of the algorithm.
+        rewards: number of rewards that the critic values, Z.
         generator: random generator of the initial weights.
     """
 
@@ -229,9 +239,10 @@ class EntropicActors(Actors[Values]):
         critic: Values,
         spaces: Mapping[str, LearnerSpaces],
         settings: OffPolicySettings,
+        rewards: int,
         generator: torch.Generator,
     ) -> None:
-        super().__init__(critic, spaces, settings, generator)
+        super().__init__(critic, spaces, settings, rewards, generator)
         self._target_entropies: dict[str, float] = {}
         for name, sizes in spaces.items():
             per_action = settings.continuous_entropy
@@ -272,6 +283,15 @@ class EntropicActors(Actors[Values]):
             return entropy.mean() / self._counts[name]
         return entropy.sum() / situation.masks[name].sum().clamp_min(1)
 
+    def _soft(self, values: Tensor, entropies: Mapping[str, Tensor]) -> Tensor:
+        """Add the entropies of learners, (N,) each, times their temperatures to values, (Z, N).
+
+        The reward of the team is valued with the entropies of all learners, the own reward of a
+        learner with its own.
+        """
+        bonuses = [self.temperature(name) * entropies[name] for name in self.nets]
+        return values + (torch.stack(bonuses) if len(values) > 1 else sum(bonuses))
+
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
         """Update the network and the temperature of a learner, and return values to log."""
         self._descend(loss, name)
@@ -301,28 +321,28 @@ class SoftActors(EntropicActors[JointValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
     ) -> Tensor:
-        """Return soft values of the target critic, (N,).
+        """Return soft values of the target critic, (Z, N).
 
         A soft value is the expected value plus the entropies times the temperatures.
         """
         log_p = self._choice_outputs(after).log_softmax(-1)
-        value = expected(self._critic(after.state, targets).amin(0), log_p.exp()).squeeze(-1)
-        return value + sum(
-            self.temperature(name) * entropies(log_p[:, numbers])
-            for name, numbers in self.numbers.items()
+        tables, p = self._least(self._critic(after.state, targets)), log_p.exp()
+        values = torch.stack([expected(table, p).squeeze(-1) for table in tables])
+        return self._soft(
+            values, {name: entropies(log_p[:, part]) for name, part in self.numbers.items()}
         )
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Raise the soft value by one learner after another, and return losses and entropies."""
         with torch.no_grad():
-            table = self._critic(situation.state).amin(0)
+            tables = self._least(self._critic(situation.state))
         log_p = {name: self._log_p(name, situation) for name in self.nets}
         probabilities = torch.cat(list(log_p.values()), dim=1).detach().exp()
         logged: dict[str, Tensor] = {}
         for name in self._order(generator):
             numbers = self.numbers[name]
             free = range(*numbers.indices(probabilities.shape[1]))
-            values = expected(table, probabilities, free)
+            values = expected(tables[self._reward_of[name]], probabilities, free)
             loss = soft_policy_loss(log_p[name], values, self.temperature(name))
             entropy = entropies(log_p[name].detach())
             logged |= self._step(name, loss, self._per_agent(name, entropy, situation))
@@ -349,10 +369,10 @@ class GaussianActors(EntropicActors[ContinuousValues]):
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, generator: torch.Generator
     ) -> Tensor:
-        """Return the target critic's soft values of actions drawn from the policies, (N,)."""
+        """Return the target critic's soft values of actions drawn from the policies, (Z, N)."""
         actions, log_p = self._draw_all(after, generator)
-        value = self._critic.of_actions(after.state, actions, targets).amin(0)
-        return value - sum(self.temperature(name) * log_p[name] for name in self.nets)
+        values = self._least(self._critic.of_actions(after.state, actions, targets))
+        return self._soft(values, {name: -x for name, x in log_p.items()})
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Raise the soft value by one learner after another, and return losses and entropies."""
@@ -363,7 +383,8 @@ class GaussianActors(EntropicActors[ContinuousValues]):
             numbers = self.numbers[name]
             part, log_p = drawn[name]
             joint = torch.cat([actions[:, : numbers.start], part, actions[:, numbers.stop :]], 1)
-            value = self._critic.of_actions(situation.state, joint).amin(0)
+            values = self._least(self._critic.of_actions(situation.state, joint))
+            value = values[self._reward_of[name]]
             loss = (self.temperature(name) * log_p - value).mean()
             entropy = self._per_agent(name, -log_p.detach(), situation)
             logged |= self._step(name, loss, entropy)
@@ -427,26 +448,27 @@ def _mean_of(values: Tensor, chosen: Tensor) -> Tensor:
     return values.where(chosen, 0.0).sum() / chosen.sum().clamp_min(1)
 
 
-def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: int) -> Tensor:
+def best_replies(tables: Mapping[int, Tensor], choices: Tensor, levels: int) -> Tensor:
     """Return the values of each action's levels while the other actions are fixed.
 
     The actions are processed one after another. Each is set to its best level before the next.
 
     Args:
-        table: values of all joint actions, (N, L^K).
+        tables: values of all joint actions, (N, L^K), for the index of each action, in the order of
+            processing.
         choices: initial level of each action, (N, K).
-        order: indices of the actions, in the order of processing.
         levels: number of levels of each action, L.
 
     Returns:
         Value of each level of each action, (N, K, L).
     """
-    taken = nn.functional.one_hot(choices, levels).to(table.dtype)
+    dtype = next(iter(tables.values())).dtype
+    taken = nn.functional.one_hot(choices, levels).to(dtype)
     rows = torch.empty_like(taken)
-    for number in order:
+    for number, table in tables.items():
         row = expected(table, taken, (number,))
         rows[:, number] = row
-        taken[:, number] = nn.functional.one_hot(row.argmax(-1), levels).to(table.dtype)
+        taken[:, number] = nn.functional.one_hot(row.argmax(-1), levels).to(dtype)
     return rows
 
 

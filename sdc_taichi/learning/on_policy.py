@@ -12,7 +12,7 @@ clipping:
 - ``ppo`` (Schulman et al. 2017) has one learner, and ``ippo`` (de Witt et al. 2020) has several.
   Each learner has a critic, which takes its observation and learns its reward. M_i is 1.
 - ``mappo`` (Yu et al. 2022) has one critic, which takes the shared state and learns the reward of
-  the team. M_i is 1.
+  the team. M_i is 1. With own rewards each learner has a critic of the shared state.
 - ``happo`` (Kuba et al. 2022; Zhong et al. 2024) has the critic of ``mappo``. Learners are updated
   one after another in random order, and M_i is the product of the ratios r_j of the learners j that
   are already updated.
@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sdc_taichi.learning.algorithms import OnPolicyDefinition, OnPolicySettings
+from sdc_taichi.learning.algorithms import OnPolicyDefinition, OnPolicySettings, own_share
 from sdc_taichi.learning.networks import (
     Actor,
     RunningMoments,
@@ -42,7 +42,7 @@ from sdc_taichi.learning.networks import (
     policy_network,
 )
 from sdc_taichi.learning.policy import PolicyNetwork
-from sdc_taichi.learning.stream import EnvironmentStream
+from sdc_taichi.learning.stream import EnvironmentStream, learned_rewards
 
 TEAM = "team"
 """Name of the critic that learns the reward of the team."""
@@ -108,9 +108,8 @@ class OnPolicy:
         seed: int,
     ) -> None:
         self._settings, self._spaces, self._updates = settings, stream.spaces, updates
-        self._definition = definition._replace(
-            critic=settings.critic or definition.critic, reward=settings.reward or definition.reward
-        )
+        self._definition = definition._replace(critic=settings.critic or definition.critic)
+        self._own_share = own_share(settings.reward, definition.reward)
         self._done = 0
         self._generators = generators(seed)
         self._actors: dict[str, Actor] = {}
@@ -361,9 +360,8 @@ class OnPolicy:
 
     def _rewards_of(self, critic: str, rollout: _Rollout) -> Tensor:
         """Return the rewards that a critic learns, (T, R)."""
-        if self._definition.reward == TEAM:
-            return self._of_rows(critic, rollout.team)
-        return rollout.rewards[critic]
+        team = self._of_rows(critic, rollout.team)
+        return learned_rewards(rollout.rewards.get(critic, team), team, self._own_share)
 
     def _of_rows(self, critic: str, of_environments: Tensor) -> Tensor:
         """Repeat values of environments, (T, B, ...), for each row of a critic, (T, R, ...)."""
@@ -397,7 +395,7 @@ class OnPolicy:
     def _make_critics(self, state_width: int) -> dict[str, _Critic]:
         """Create a critic for each learner, or a single critic for the team."""
         shared = self._definition.critic == "state"
-        names = [TEAM] if self._definition.reward == "team" and shared else list(self._spaces)
+        names = [TEAM] if not self._own_share and shared else list(self._spaces)
         critics = {}
         for name in names:
             width = state_width if shared else self._spaces[name].observation_width

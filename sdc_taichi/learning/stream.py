@@ -76,6 +76,19 @@ class StreamStep(NamedTuple):
     """Masks after the step, (R,) each, as the attribute ``masks`` of the stream."""
 
 
+def learned_rewards(own: Tensor, team: Tensor, own_share: float) -> Tensor:
+    """Return the mixture of own rewards and rewards of the team that learners learn from.
+
+    Args:
+        own: own rewards of a learner.
+        team: mean rewards of the learning agents, of the same shape.
+        own_share: share of the own rewards, 0..1.
+    """
+    if own_share in (0.0, 1.0):
+        return own if own_share else team
+    return own_share * own + (1.0 - own_share) * team
+
+
 class _Rewards(NamedTuple):
     """Rewards of one step of all environments."""
 

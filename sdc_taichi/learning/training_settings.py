@@ -338,6 +338,16 @@ class TrainingSettings(Section):
             return value
         return validated(kind, value, f"settings of {info.data['algorithm']}")
 
+    @field_validator("learning")
+    @classmethod
+    def _of_several_learners(cls, value: LearningSettings, info: Any) -> LearningSettings:
+        """Refuse a reward of its own for the only learner, whose reward is that of the team."""
+        if info.data.get("algorithm") == "ppo" and value.reward not in (None, "team", 0.0):
+            raise ValueError(
+                f"reward {value.reward!r}: ppo has one learner for all agents; valid is team"
+            )
+        return value
+
     @field_validator("environment")
     @classmethod
     def _plain(cls, value: EnvOptions) -> EnvOptions:
