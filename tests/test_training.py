@@ -203,6 +203,60 @@ def test_benchmarl_trains_all_agents_reproducibly(example: Load) -> None:
     assert returns[0].partition(":")[2] != returns[1].partition(":")[2]
 
 
+# --- skrl and a single file in the manner of CleanRL ---
+
+SMALL = {"num_envs": 2, "steps": 96, "days": 1, "rollout": 24, "seed": 3}
+
+
+def test_skrl_wrapper_gives_what_the_batch_gives(example: Load) -> None:
+    skrl = example("train_skrl", "skrl")
+    torch = importlib.import_module("torch")
+    env = skrl.make(num_envs=3, days=1, seed=5)
+    twin = sdc_taichi.vector_env(3, days=1, autoreset_mode="NextStep")
+    first, _ = env.reset()
+    expected, _ = twin.reset(seed=5)
+    np.testing.assert_array_equal(first["agent_dc"], expected["agent_dc"])
+    rng = np.random.default_rng(0)
+    for step in range(DAY + 2):
+        actions = {agent: rng.integers(0, 3, 3) for agent in AGENTS}
+        columns = {agent: torch.from_numpy(x).unsqueeze(-1) for agent, x in actions.items()}
+        observations, rewards, terminated, truncated, _ = env.step(columns)
+        expected, paid, *_ = twin.step(actions)
+        for agent in AGENTS:
+            np.testing.assert_array_equal(observations[agent], expected[agent])
+            np.testing.assert_array_equal(rewards[agent][:, 0], paid[agent].astype(np.float32))
+            np.testing.assert_array_equal(env.state()[agent], twin.state())
+            assert truncated[agent].squeeze(-1).tolist() == [step == DAY - 1] * 3
+            assert not terminated[agent].any()
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("name", ["train_skrl", "train_cleanrl"])
+def test_batches_train_all_agents_reproducibly(
+    example: Load, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = example(name, *(["skrl"] if name == "train_skrl" else []))
+    for _ in range(2):
+        module.train(**SMALL)
+    printed = [line for line in capsys.readouterr().out.splitlines() if "mean reward" in line]
+    assert [line.partition(":")[0] for line in printed] == ["untrained", "trained"] * 2
+    assert printed[:2] == printed[2:]
+    assert printed[0].partition(":")[2] != printed[1].partition(":")[2]
+
+
+def test_advantages_of_a_single_file_end_with_their_episode(example: Load) -> None:
+    ppo = example("train_cleanrl")
+    torch = importlib.import_module("torch")
+    rewards, values = torch.tensor([[1.0], [2.0], [4.0]]), torch.tensor([[0.5], [0.25], [1.0]])
+    next_values, ended = torch.tensor([[0.25], [3.0], [0.0]]), torch.tensor([[0], [1], [1]]).bool()
+    ratio = ppo.GAMMA * ppo.LAMBDA
+    second = 2.0 + ppo.GAMMA * 3.0 - 0.25
+    expected = [1.0 + ppo.GAMMA * 0.25 - 0.5 + ratio * second, second, 4.0 - 1.0]
+    advantages = ppo.advantages(rewards, values, next_values, ended)
+    np.testing.assert_allclose(advantages[:, 0], expected, rtol=1e-6)
+
+
 # --- RLlib ---
 
 RLLIB = """
