@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ import pytest
 
 from sdc_taichi import build_fleet, make_controller
 from sdc_taichi.benchmark.cases import data_centers
-from sdc_taichi.benchmark.jobs import DoneJob, run_job
+from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
+from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, run_job
+from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.suite import Suite, make_suite
-from sdc_taichi.benchmark.suite_run import row_jobs
+from sdc_taichi.benchmark.suite_run import row_jobs, run_suite, study_of
+from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
 
 pytest.importorskip("torch", reason="torch is not installed: make test-train")
 
@@ -82,3 +86,32 @@ def test_agents_trained_apart_act_together(tmp_path: Path) -> None:
     fleet = build_fleet(data_centers(chosen.cases["tiny"], "held-out"))
     make_controller(spec, fleet)
     assert len(pd.read_parquet(io.BytesIO(done.rows))) == 1
+    assert run(chosen).files == done.files
+    # The first agent learns beside idle others, and the last one beside those trained before.
+    for agent, part, is_equal in (("agent_ls", "load", True), ("agent_bat", "battery", False)):
+        one = suite(train=TRAIN | {"environment": {"agents": [agent]}})
+        curve = run(one).files["validation.csv"]
+        assert (done.files[f"{part}/validation.csv"] == curve) is is_equal
+
+
+def test_policies_run_in_cases_in_which_they_were_not_trained(tmp_path: Path) -> None:
+    away = {"trained_in": "tiny", "weeks": [29]}
+    chosen = make_suite(suite(train=TRAIN, agents_alone=True).model_dump() | {
+        "cases": {"tiny": CASE, "away": away}
+    })  # fmt: skip
+    store = ResultStore(tmp_path)
+
+    def stage(_: str, jobs: Sequence[Job], __: int, inputs: Inputs | None = None) -> JobSummary:
+        return run_jobs(jobs, store, Executor(), inputs)
+
+    with store.claimed(study_of(chosen, chosen, "command")):
+        run_suite(chosen, store, stage)
+    rows = store.rows().set_index("case")
+    assert rows["week"]["away"].tolist() == [29] * 4
+    assert rows["moves"]["away"].tolist() == ["all", "load", "cooling", "battery"]
+    policy = store.folder_of({"suite": "learners", "case": "tiny", "row": "ippo", "seed": "0"})
+    home = data_centers(chosen.cases["tiny"], "held-out")
+    with prepare(home, [29], optimum=False, days=2) as weeks:
+        controller = make_controller(f"policy:{policy}", weeks.sim.fleet)
+        again = evaluate(weeks, [Contender("again", controller)], beside=False).rows
+    assert again["figure"].tolist() == rows["figure"]["away"].tolist()[:1]

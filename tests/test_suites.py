@@ -240,6 +240,51 @@ def test_errors_of_forecasts_are_those_of_a_case_and_share_its_optima() -> None:
     assert {job.partition["case"] for job in reference_jobs(alone)} == {"noisy"}
 
 
+def elsewhere(**changes: Any) -> Suite:
+    cases = {
+        "away": {"trained_in": "tiny", "test": {"sites": ["TX"]}, **changes},
+        "tiny": {**SMALL["cases"]["tiny"], "sites": ["NY"], "days": 3},
+    }
+    return small(cases=cases)
+
+
+def test_cases_take_policies_and_choices_of_another_case() -> None:
+    suite = elsewhere()
+    away = suite.cases["away"]
+    assert (away.sites, away.days, away.test.sites) == (("NY",), 3, ("TX",))
+    assert make_suite(yaml.safe_load(suite.to_yaml())) == suite
+    assert "days" not in yaml.safe_load(suite.to_yaml())["cases"]["away"]
+    references = reference_jobs(suite)
+    names = {job.name.removeprefix("small/") for job in references}
+    assert names == {f"tiny/reference-{x}-ny/0" for x in ("held-out", "validation")} | {
+        "away/reference-held-out-tx/0"
+    }
+    jobs = {job.name.removeprefix("small/"): job for job in row_jobs(suite, references)}
+    for name in ("ippo/1", "best-constant/0"):
+        maker, job = jobs[f"tiny/{name}"], jobs[f"away/{name}"]
+        assert job.values["made_by"] == maker.name
+        optimum = "small/away/reference-held-out-tx/0"
+        assert set(job.inputs) == {maker.name, optimum}
+        assert job.inputs[maker.name] == maker.key
+    assert "made_by" not in jobs["away/idle/0"].values
+    assert set(suite.chosen(cases=["away"]).cases) == {"away", "tiny"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trained_in": "here"}, "cases.away.trained_in 'here'; valid: tiny"),
+        ({"days": 4}, "cases.away.days: is that of tiny; valid is without"),
+    ],
+)
+def test_cases_change_only_results_of_another_case(
+    changes: Mapping[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        elsewhere(**changes)
+    assert message in str(caught.value)
+
+
 def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> None:
     def keys(**changes: Any) -> dict[str, str]:
         suite = small(**changes)
@@ -295,6 +340,17 @@ def test_rows_stand_between_idle_commands_and_the_bound(store: ResultStore) -> N
     metrics = store.result(partition).metrics
     changes = metrics["validation_change_pct"]
     assert metrics["chosen"] == min(changes, key=changes.__getitem__)
+
+
+def test_a_choice_of_another_case_is_taken(tmp_path: Path) -> None:
+    results = ResultStore(tmp_path / "away")
+    suite = elsewhere(weeks=[29]).chosen(cases=["away"], rows=["best-constant"])
+    assert [(each.done, each.failed) for each in run(suite, results)] == [(3, ()), (1, ()), (1, ())]
+    partition = {"suite": "small", "case": "tiny", "row": "best-constant", "seed": "0"}
+    chosen = results.result(partition).metrics["chosen"]
+    metrics = results.result(partition | {"case": "away"}).metrics
+    assert (metrics["chosen"], metrics["sites"], metrics["weeks"]) == (chosen, ["tx"], [29])
+    assert metrics["made_by"] == "small/tiny/best-constant/0"
 
 
 def test_a_study_goes_on_with_more_rows_and_seeds_and_no_other_cases(store: ResultStore) -> None:

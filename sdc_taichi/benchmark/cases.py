@@ -79,7 +79,7 @@ def training_settings(
         objective: objective of the suite, by which the best policy is chosen.
         seed: seed of the training.
         training: settings of all trainings of the suite.
-        agent: the only agent that learns, with idle others; None selects the agents of the row.
+        agent: the only agent that learns, beside idle others; None selects the agents of the row.
 
     Raises:
         ConfigError: a setting is not valid, or is determined by the case.

@@ -30,6 +30,8 @@ REFERENCE = "reference"
 Part = Literal["held-out", "validation"]
 """Part of a case: held-out weeks for the results, or validation weeks for choices."""
 _CONTENT = ("controller", "best_of", "train", "optimum")
+_OF_RESULTS = ("about", "trained_in", "test", "weeks", "rows")
+"""Fields of a case with ``trained_in`` that may differ from those of the other case."""
 
 
 def _weeks(value: Any) -> Any:
@@ -75,6 +77,9 @@ class Case(Section):
 
     about: Text = ""
     """Description of the case in one sentence."""
+    trained_in: Name | None = None
+    """Name of another case, in which the policies of trained rows learn and the best of several
+    controllers is chosen. All fields but those of the results are those of that case."""
     scenario: str | None = None
     """Training scenario that provides default data centers and rewards; None selects no
     scenario."""
@@ -169,8 +174,8 @@ class Row(Section):
     """Reference from the optimum: ``achieved`` for the path that the optimum achieves in
     simulation, ``bound`` for the bound of the objective."""
     apart: bool = False
-    """True to train each agent separately while the others are idle, and to run all agents
-    together afterwards."""
+    """True to train the agents one after another (load, cooling, battery), each while those that
+    were trained before act and the others are idle, and to run all agents together afterwards."""
     agents_alone: bool = False
     """True to run each trained agent also alone, while the others are idle."""
     seeds: Seeds | None = None
@@ -193,6 +198,11 @@ class Row(Section):
         if len(set(self.controllers)) < len(self.controllers):
             raise ValueError(f"best_of: {', '.join(self.controllers)}; valid is each once")
         return self
+
+    @property
+    def chooses(self) -> bool:
+        """True if the controller of the row is trained, or chosen among several."""
+        return self.train is not None or self.best_of is not None
 
     @property
     def controllers(self) -> tuple[str, ...]:
@@ -257,6 +267,37 @@ class Suite(Section):
                 raise ValueError(f"{name}: valid is a name that does not begin with {REFERENCE}")
         return value
 
+    @model_validator(mode="before")
+    @classmethod
+    def _cases_have_fields_of_others(cls, values: Any) -> Any:
+        """Add to cases with ``trained_in`` the fields of the other case."""
+        cases = values.get("cases") if isinstance(values, Mapping) else None
+        if not isinstance(cases, Mapping):
+            return values
+        filled = dict(cases)
+        for name, case in cases.items():
+            other = cases.get(case.get("trained_in")) if isinstance(case, Mapping) else None
+            if isinstance(other, Mapping):
+                base = {k: v for k, v in other.items() if k not in ("about", "rows")}
+                filled[name] = merged(base, case)
+        return {**values, "cases": filled}
+
+    @model_validator(mode="after")
+    def _cases_are_trained_in_others(self) -> Self:
+        trained = {name: case.trained_in for name, case in self.cases.items() if case.trained_in}
+        for name, other in trained.items():
+            valid = [x for x in self.cases if x not in trained]
+            if other not in valid:
+                raise ValueError(f"cases.{name}.trained_in {other!r}; valid: {', '.join(valid)}")
+            for field in Case.model_fields:
+                equal = getattr(self.cases[name], field) == getattr(self.cases[other], field)
+                if field not in _OF_RESULTS and not equal:
+                    raise ValueError(f"cases.{name}.{field}: is that of {other}; valid is without")
+            for label, row in self.rows.items():
+                if row.chooses and self.is_for(label, name) and not self.is_for(label, other):
+                    raise ValueError(f"rows.{label}: runs in case {name}, and not in {other}")
+        return self
+
     @model_validator(mode="after")
     def _rows_are_for_cases(self) -> Self:
         for name, row in self.rows.items():
@@ -280,6 +321,10 @@ class Suite(Section):
     def to_yaml(self) -> str:
         """Return the suite as YAML text, from which ``load_suite`` reads an equal suite."""
         values = self.model_dump(mode="json", exclude_defaults=True)
+        cases = values["cases"]
+        for name, case in self.cases.items():
+            if case.trained_in is not None:
+                cases[name] = _without(cases[name], cases[case.trained_in])
         return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
     def is_for(self, row: str, case: str) -> bool:
@@ -300,7 +345,8 @@ class Suite(Section):
         """Return the suite reduced to selected cases and rows, or with another number of seeds.
 
         Args:
-            cases: names of the cases; an empty sequence selects all cases.
+            cases: names of the cases; an empty sequence selects all cases. Cases that these were
+                trained in are added.
             rows: names of the rows; an empty sequence selects all rows.
             seeds: number of seeds; None selects the number of the suite.
 
@@ -315,7 +361,8 @@ class Suite(Section):
                 if name not in values[kind]:
                     meant = suggestion_or_valid(name, values[kind])
                     raise ConfigError(f"suite {self.name}: no {kind[:-1]} {name!r}{meant}")
-            values[kind] = {k: v for k, v in values[kind].items() if not names or k in names}
+            chosen = [*names, *(self.cases[x].trained_in for x in names if kind == "cases")]
+            values[kind] = {k: v for k, v in values[kind].items() if not names or k in chosen}
         for case in values["cases"].values():
             if case["rows"] is not None:
                 case["rows"] = tuple(row for row in case["rows"] if row in values["rows"])
@@ -406,6 +453,15 @@ def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
                 raise ConfigError(f"{label}: quick.{kind}: no {kind[:-1]} {name!r}{meant}")
         changed[kind] = {name: x for name, x in changed[kind].items() if x is not None}
     return changed
+
+
+def _without(values: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested values without those that ``base`` has too, as ``merged`` adds them again."""
+    return {
+        name: _without(value, base[name]) if isinstance(value, Mapping) and name in base else value
+        for name, value in values.items()
+        if name not in base or base[name] != value
+    }
 
 
 def _content(value: Any) -> Any:

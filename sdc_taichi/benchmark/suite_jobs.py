@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -49,6 +50,8 @@ from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from sdc_taichi.learning.training_settings import TrainingSettings
 
 _CURVES = ("training.csv", "validation.csv")
 """Learning curves of a training, which are stored with its settings and policy."""
@@ -104,8 +107,9 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
 
     Args:
         values: ``case``, ``row``, ``name`` of the row, ``training`` (settings of all trainings),
-            ``objective`` and ``seed``.
-        inputs: optima of the weeks, as archives from ``packed``.
+            ``objective`` and ``seed``; and ``made_by``, the input with the result of the job that
+            trained or chose the controller, if this job does not.
+        inputs: optima of the weeks and results of other jobs, as archives from ``packed``.
 
     Returns:
         Result with a table row for each week, with the columns of ``learning.evaluation``; its
@@ -113,11 +117,11 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
     """
     task = _Task.model_validate(values)
     with TemporaryDirectory() as scratch:
-        optima = Path(scratch) / "optima"
+        optima, made_before = Path(scratch) / "optima", Path(scratch) / "made"
         optima.mkdir()
-        for content in inputs.values():
+        for name, content in inputs.items():
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                archive.extractall(optima)
+                archive.extractall(made_before if name == task.made_by else optima)
         made = _made(task, Path(scratch), optima)
         with _weeks(task, "held-out", optima) as weeks:
             rows = _rows(task, made, weeks)
@@ -126,16 +130,18 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
     return JobResult(rows, metrics, made.files)
 
 
-def packed(files: Mapping[str, bytes]) -> bytes:
-    """Return the files of a job with optima as a reproducible ZIP archive, for use as an input.
+def packed(files: Mapping[str, bytes], metrics: Mapping[str, Any]) -> bytes:
+    """Return metrics and files of a job as a reproducible ZIP archive, for use as an input.
 
     Args:
         files: content of each file by name.
+        metrics: metrics of the job.
     """
+    contents = {**files, METRICS_FILE: json.dumps(metrics, sort_keys=True).encode()}
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
-        for name in sorted(files):
-            archive.writestr(zipfile.ZipInfo(name), files[name])
+        for name in sorted(contents):
+            archive.writestr(zipfile.ZipInfo(name), contents[name])
     return out.getvalue()
 
 
@@ -201,6 +207,9 @@ class _Task(BaseModel):
     """Objective by which rows are compared."""
     seed: int
     """Seed of all random numbers."""
+    made_by: str | None = None
+    """Input with the result of the job that trained or chose the controller; None if this job
+    does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +227,9 @@ class _Made:
 
 
 def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
-    """Train or choose the controller of a row, if necessary."""
+    """Train or choose the controller of a row, if necessary, or take it from another job."""
+    if task.made_by is not None:
+        return _made_before(task, scratch / "made")
     if task.row.train is not None:
         return _trained(task, scratch, optima)
     if task.row.best_of is None:
@@ -238,29 +249,51 @@ def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
     return _Made(best, {"chosen": best, "validation_change_pct": changes}, {})
 
 
+def _made_before(task: _Task, folder: Path) -> _Made:
+    """Return the controller of a row that another job has trained or chosen."""
+    metrics = json.loads((folder / METRICS_FILE).read_text("utf-8"))
+    made_by: dict[str, Any] = {"made_by": task.made_by}
+    if task.row.best_of is not None:
+        return _Made(metrics["chosen"], made_by | {"chosen": metrics["chosen"]}, {})
+    parts = metrics["trainings"] if task.row.apart else [""]
+    moved = tuple(short_name(agent) for agent in agents_of(_settings(task)))
+    return _Made(_spec({part: folder / part for part in parts}), made_by, {}, moved)
+
+
+def _spec(folders: Mapping[str, Path]) -> str:
+    """Return the name of the controller with the policy of each part, or of all agents (``""``)."""
+    return ",".join(
+        f"{part}=policy:{folder}" if part else f"policy:{folder}"
+        for part, folder in folders.items()
+    )
+
+
+def _settings(task: _Task, agent: str | None = None) -> TrainingSettings:
+    """Return the settings of the training of a row, or of one of its agents alone."""
+    return training_settings(
+        task.case,
+        task.row,
+        objective=task.objective,
+        seed=task.seed,
+        training=task.training,
+        agent=agent,
+    )
+
+
 def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
-    """Train the policy of a row, or one for each of its agents."""
+    """Train the policy of a row, or of each of its agents while those trained before act."""
     from sdc_taichi.learning import train
 
-    def settings_of(agent: str | None) -> Any:
-        return training_settings(
-            task.case,
-            task.row,
-            objective=task.objective,
-            seed=task.seed,
-            training=task.training,
-            agent=agent,
-        )
-
-    agents = agents_of(settings_of(None))
+    agents = agents_of(_settings(task))
     moved = tuple(short_name(agent) for agent in agents)
     files: dict[str, bytes] = {}
-    metrics, specs = {}, []
+    metrics: dict[str, Any] = {}
+    folders: dict[str, Path] = {}
     for agent in agents if task.row.apart else (None,):
         part = AGENT_DEFINITIONS[agent].command if agent else ""
         folder = scratch / "training" / part
         folder.parent.mkdir(parents=True, exist_ok=True)
-        done = train(settings_of(agent), folder, cache=optima)
+        done = train(_settings(task, agent), folder, others=_spec(folders) or None, cache=optima)
         files |= {
             (Path(part) / name).as_posix(): x for name, x in _files_of_training(folder).items()
         }
@@ -269,8 +302,8 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
             "steps": done.steps,
             "validation": None if done.best is None else done.best._asdict(),
         }
-        specs.append(f"{part}=policy:{folder}" if part else f"policy:{folder}")
-    return _Made(",".join(specs), {"trainings": metrics}, files, moved)
+        folders[part] = folder
+    return _Made(_spec(folders), {"trainings": metrics}, files, moved)
 
 
 def _files_of_training(folder: Path) -> dict[str, bytes]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Protocol, get_args
@@ -17,9 +17,9 @@ from sdc_taichi.control.registry import parts_of
 from sdc_taichi.learning.policy import WEIGHTS
 
 _FUNCTIONS = "sdc_taichi.benchmark.suite_jobs"
-OPTIMA, ROWS = "optima", "rows"
-"""Names of the two stages of a suite's execution."""
-_NOT_OF_OPTIMA = {"about", "rows", "training_weeks", "forecast_error"}
+OPTIMA, ROWS, OTHER_CASES = "optima", "rows", "rows of other cases"
+"""Names of the stages of a suite's execution; the last one has cases with ``trained_in``."""
+_NOT_OF_OPTIMA = {"about", "rows", "training_weeks", "forecast_error", "trained_in"}
 """Fields of cases on which optima do not depend."""
 _MAY_CHANGE = (
     "suite.rows.*",
@@ -116,7 +116,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         suite: the suite.
         references: finished jobs that computed the optima of the suite.
     """
-    jobs = []
+    jobs: list[Job] = []
     names = {job.key: job.name for job in references}
     files = {name: _files(case) for name, case in suite.cases.items()}
     solved = {
@@ -126,13 +126,17 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         for name in suite.cases
         for part in _parts_needed(suite, name)
     }
+    made: dict[tuple[str, str], list[Job]] = {}
+    # Cases in which policies are trained come before those that take them.
+    cases = sorted(suite.cases.items(), key=lambda pair: pair[1].trained_in is not None)
     for label, row in suite.rows.items():
-        for name, case in suite.cases.items():
+        for name, case in cases:
             if not suite.is_for(label, name):
                 continue
-            policies = _policies(row)
-            inputs = {k: v for part in _parts_of(row) for k, v in solved[name, part].items()}
+            policies, parts = _policies(row), _parts_of(row, case)
+            optima = {k: v for part in parts for k, v in solved[name, part].items()}
             for seed in range(number_of_seeds(suite, name, label)):
+                inputs = dict(optima)
                 values = {
                     "name": label,
                     "case": case.model_dump(mode="json", exclude={"about", "rows"}),
@@ -145,7 +149,15 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                 if policies:
                     values["policies"] = policies
                 partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
-                jobs.append(Job(f"{_FUNCTIONS}:run_row", values, partition, inputs, check_row))
+                if case.trained_in is not None and row.chooses:
+                    # With one seed there, it is that of all seeds here.
+                    made_there = made[case.trained_in, label]
+                    maker = made_there[min(seed, len(made_there) - 1)]
+                    values["made_by"] = maker.name
+                    inputs |= {maker.name: maker.key}
+                job = Job(f"{_FUNCTIONS}:run_row", values, partition, inputs, check_row)
+                made.setdefault((name, label), []).append(job)
+                jobs.append(job)
     return jobs
 
 
@@ -164,17 +176,25 @@ def run_suite(suite: Suite, store: ResultStore, run: RunStage) -> None:
     if references:
         run(OPTIMA, references, len(references))
     rows = sorted(row_jobs(suite, references), key=_steps, reverse=True)
-    run(ROWS, rows, len(rows), _optima(store, references))
+    of_others = [job for job in rows if "made_by" in job.values]
+    rows = [job for job in rows if "made_by" not in job.values]
+    optima = _packed_results(store, references)
+    run(ROWS, rows, len(rows), optima)
+    if of_others:
+        makers = {job.values["made_by"] for job in of_others}
+        made = _packed_results(store, [job for job in rows if job.name in makers])
+        run(OTHER_CASES, of_others, len(of_others), {**optima, **made})
 
 
-def _optima(store: ResultStore, references: Sequence[Job]) -> Mapping[str, bytes]:
-    """Return the computed optima as inputs, by the names of their jobs."""
-    optima = {}
-    for job in references:
+def _packed_results(store: ResultStore, jobs: Sequence[Job]) -> dict[str, bytes]:
+    """Return metrics and files of finished jobs as inputs, by the names of the jobs."""
+    results = {}
+    for job in jobs:
         if store.is_done(job):
-            names = store.result(job.partition).files_sha256
-            optima[job.name] = packed({name: store.file(job.partition, name) for name in names})
-    return optima
+            record = store.result(job.partition)
+            files = {name: store.file(job.partition, name) for name in record.files_sha256}
+            results[job.name] = packed(files, record.metrics)
+    return results
 
 
 def _steps(job: Job) -> int:
@@ -215,13 +235,14 @@ def _policies(row: Row) -> dict[str, str]:
 
 def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:
     """Return the parts of a case (held-out, validation) whose optima its rows need."""
-    of_rows = [_parts_of(row) for name, row in suite.rows.items() if suite.is_for(name, case)]
-    needed = {part for parts in of_rows for part in parts}
+    settings = suite.cases[case]
+    rows = [row for name, row in suite.rows.items() if suite.is_for(name, case)]
+    needed = {part for row in rows for part in _parts_of(row, settings)}
     order: tuple[Part, ...] = ("held-out", "validation")
     return tuple(part for part in order if part in needed)
 
 
-def _parts_of(row: Row) -> tuple[Part, ...]:
+def _parts_of(row: Row, case: Case) -> tuple[Part, ...]:
     """Return the parts of a case (held-out, validation) whose optima a row needs."""
-    chooses = row.train is not None or row.best_of is not None
-    return ("held-out", "validation") if chooses else ("held-out",)
+    chooses_here = row.chooses and case.trained_in is None
+    return ("held-out", "validation") if chooses_here else ("held-out",)

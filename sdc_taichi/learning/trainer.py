@@ -109,6 +109,7 @@ def train(
     out: Path | str,
     *,
     resume: bool = False,
+    others: str | None = None,
     cache: bool | str | os.PathLike[str] = True,
     on_update: Callable[[Progress], None] | None = None,
     on_stage: StageProgress | None = None,
@@ -122,6 +123,8 @@ def train(
         resume: True to continue the training in the folder. The result is bit-identical to that of
             an uninterrupted training. The saved settings must equal ``settings``, except that
             ``steps`` may be larger.
+        others: name of the controller of the agents that do not learn, in place of that of the
+            settings, of which the policy keeps that of the settings.
         cache: whether to read and write optima of the validation weeks in the user's cache, or the
             folder to use instead.
         on_update: called after every update.
@@ -136,7 +139,7 @@ def train(
     """
     path = Path(out)
     with _one_thread(), claimed(path, settings, resume=resume):
-        run = _Run(settings, path)
+        run = _Run(settings, path, others)
         try:
             if resume:
                 run.resume()
@@ -152,9 +155,9 @@ def train(
 class _Run:
     """State of a running training: environments, algorithm, progress and best result."""
 
-    def __init__(self, settings: TrainingSettings, folder: Path) -> None:
-        self._settings, self._folder = settings, folder
-        self._env = env = make_env(settings)
+    def __init__(self, settings: TrainingSettings, folder: Path, others: str | None = None) -> None:
+        self._settings, self._folder, self._others = settings, folder, others
+        self._env = env = make_env(settings, others)
         try:
             self._stream = make_stream(settings, env)
             own_policies = self._stream.own_policies
@@ -314,7 +317,8 @@ class _Run:
     def _validate(self, weeks: DataCenterWeeks) -> Validation:
         """Run the policy in the validation weeks, and save it if its objective is a new minimum."""
         policy = self._policy()
-        validation = validate(PolicyController(policy, weeks.sim.fleet), weeks)
+        controller = PolicyController(policy, weeks.sim.fleet, others=self._others)
+        validation = validate(controller, weeks)
         if self._best is None or validation.change_pct < self._best.change_pct:
             self._best = validation
             policy.save(self._folder / BEST_POLICY)
@@ -387,7 +391,7 @@ class _Run:
             seed=self._settings.seed,
             steps=self._steps,
             fingerprint=self._fingerprint,
-            others=self._env.core.options.others,
+            others=self._settings.environment.others,
             version=version("sdc-taichi"),
         )
         return Policy(
@@ -439,8 +443,12 @@ def make_algorithm(
     raise TypeError(f"no algorithm has {type(settings).__name__}")
 
 
-def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
+def make_env(settings: TrainingSettings, others: str | None = None) -> MultiAgentVectorEnv:
     """Create the batch of environments of a training.
+
+    Args:
+        settings: settings of the training.
+        others: controller of the agents that do not learn; None selects that of the settings.
 
     Raises:
         SdcError: a configuration or option is not valid, or the number of data centers is smaller
@@ -454,8 +462,11 @@ def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
         raise ConfigError(
             f"data_centers {count}: {len(configs)} of sites and weeks; valid is as many or more"
         )
+    options = settings.options()
+    if others is not None:
+        options = options.model_copy(update={"others": others})
     return vector_env(
-        count, configs, options=settings.options(), precision=settings.precision,
+        count, configs, options=options, precision=settings.precision,
         autoreset_mode="SameStep",
     )  # fmt: skip
 
