@@ -65,7 +65,6 @@ def test_a_suite_is_run_and_goes_on_with_what_is_missing(file: Path, tmp_path: P
         (["carbon", "--rows", "idel"], "no row 'idel'; did you mean 'idle'?"),
         (["carbon", "--cases", "none"], "no case 'none'; valid: eight-sites"),
         (["carbon", "--seeds", "0"], "--seeds"),
-        (["FILE", "--quick"], "has no quick form"),
     ],
 )
 def test_bad_arguments_are_one_line(file: Path, arguments: Sequence[str], message: str) -> None:

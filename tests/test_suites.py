@@ -70,6 +70,7 @@ def test_suites_of_the_package_are_valid(name: str, quick: bool) -> None:
     assert suite.name == name
     assert suite.about
     assert not suite.quick or not quick
+    assert set(load_suite(name).cases) >= set(suite.cases)
 
 
 def test_another_policy_in_a_folder_makes_another_job(tmp_path: Path) -> None:
@@ -159,8 +160,25 @@ def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: 
     assert (whole.seeds, quick_form.seeds) == (2, 1)
     assert quick_form.cases["tiny"].sites == ("NY",)
     assert quick_form.cases["tiny"].days == 2
+    assert quick_form.cases["tiny"].training_weeks == (0, 9, 13, 22, 26, 35, 39, 48)
+    assert quick_form.training["steps"] == 100_000
     assert set(whole.rows) - set(quick_form.rows) == {"ippo"}
     assert make_suite(yaml.safe_load(quick_form.to_yaml())) == quick_form
+
+
+def test_a_suite_extends_one_of_the_package(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "extends: carbon\ntitle: Mine\ncases: {noisy: null, eight-sites: {days: 3}}\n"
+        "rows: {ippo: null, mine: {controller: coldest}}\n"
+    )
+    mine, base = load_suite(str(file)), load_suite("carbon")
+    assert (mine.name, mine.title, list(mine.cases)) == ("mine", "Mine", ["eight-sites"])
+    assert list(mine.rows) == [*(name for name in base.rows if name != "ippo"), "mine"]
+    assert mine.cases["eight-sites"] == base.cases["eight-sites"].model_copy(update={"days": 3})
+    file.write_text("extends: carbn\n")
+    with pytest.raises(ConfigError, match=r"extends 'carbn'.*did you mean 'carbon'"):
+        load_suite(str(file))
 
 
 @pytest.mark.parametrize("name", suite_names())
@@ -176,8 +194,7 @@ def test_what_is_shown_is_a_whole_suite(
     if "--rows" in options:
         suite = suite.chosen(rows=["idle"], seeds=3)
     assert load_suite(str(file)) == suite
-    assert bool(suite.quick) == (options != ("--quick",))
-    if suite.quick:
+    if "--quick" not in options:
         quick = load_suite(str(file), quick=True)
         whole = load_suite(name, quick=True)
         assert quick == (

@@ -22,13 +22,21 @@ from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
-from sdc_taichi.learning.training_settings import Year, merged, read_values
+from sdc_taichi.learning.training_settings import SCENARIOS, Year, merged, read_values
 from sdc_taichi.optimum.objective import Objective
 
 REFERENCE = "reference"
 """Name prefix of jobs that compute optima; names of rows must not begin with it."""
 Part = Literal["held-out", "validation"]
 """Part of a case: held-out weeks for the results, or validation weeks for choices."""
+_QUICK: Mapping[str, Any] = {
+    "seeds": 2,
+    "training": {"steps": 100_000, "data_centers": 32, "validation": {"steps": 50_000}},
+}
+"""Values of the short version of every suite, beside those that depend on its cases."""
+_QUICK_DAYS, _QUICK_PLACES, _QUICK_TRAINING_WEEKS, _QUICK_CANDIDATES = 3, 2, 8, 16
+"""Short version: days of a week, sites and weeks of results and validation, training weeks, and
+candidates of cross-entropy, of which there are no more than data centers."""
 _CONTENT = ("controller", "best_of", "train", "optimum")
 _OF_RESULTS = ("about", "trained_in", "test", "weeks", "rows")
 """Fields of a case with ``trained_in`` that may differ from those of the other case."""
@@ -124,6 +132,25 @@ class Case(Section):
     @classmethod
     def _whole(cls, value: Any) -> Any:
         return _content(value)
+
+    def short(self) -> dict[str, Any]:
+        """Return the values of the case that differ in the short version of a suite."""
+        sites = self.sites or SCENARIOS.get(self.scenario or "", {}).get("sites", ())
+        years = self.validation_years or self.years
+        test = {"sites": self.test.sites[:_QUICK_PLACES], "years": self.test.years[:1]}
+        of_results = {
+            "weeks": _spread(self.weeks, _QUICK_PLACES),
+            "test": {name: list(x) for name, x in test.items() if x},
+        }
+        if self.trained_in is not None:
+            return of_results
+        return of_results | {
+            "sites": list(sites[:_QUICK_PLACES]),
+            "training_weeks": _spread(self.training_weeks, _QUICK_TRAINING_WEEKS),
+            "validation_weeks": _spread(self.validation_weeks, _QUICK_PLACES),
+            "validation_years": list(years[:1]),
+            "days": min(self.days, _QUICK_DAYS),
+        }
 
     @property
     def error(self) -> ForecastError:
@@ -243,8 +270,9 @@ class Suite(Section):
     rows: dict[Name, Row] = Field(min_length=1)
     """Controllers and methods to compare, by name, in the order of the tables."""
     quick: dict[str, Any] = Field(default={})
-    """Values that replace others in a short version of the suite, which runs in minutes; the value
-    null removes a case or row."""
+    """Values that replace others in the short version of the suite, which runs in minutes; the
+    value null removes a case or row. By default it has two sites in one year, two weeks of three
+    days and short trainings."""
 
     @field_validator("objective")
     @classmethod
@@ -320,12 +348,42 @@ class Suite(Section):
 
     def to_yaml(self) -> str:
         """Return the suite as YAML text, from which ``load_suite`` reads an equal suite."""
+        return yaml.safe_dump(self._values(), sort_keys=False, allow_unicode=True)
+
+    def _values(self) -> dict[str, Any]:
+        """Return the plain values that are not defaults or those of another case."""
         values = self.model_dump(mode="json", exclude_defaults=True)
         cases = values["cases"]
         for name, case in self.cases.items():
             if case.trained_in is not None:
                 cases[name] = _without(cases[name], cases[case.trained_in])
-        return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+        return values
+
+    def short(self, label: str) -> Suite:
+        """Return the short version of the suite.
+
+        Args:
+            label: origin of the suite, which begins every error message.
+
+        Raises:
+            ConfigError: ``quick`` names unknown cases or rows, or a value is not valid.
+        """
+        values = self._values()
+        changes = values.pop("quick", {})
+        for kind in ("cases", "rows"):
+            for name in changes.get(kind, ()):
+                if name not in values[kind]:
+                    meant = suggestion_or_valid(name, values[kind])
+                    raise ConfigError(f"{label}: quick.{kind}: no {kind[:-1]} {name!r}{meant}")
+        cases = {name: case.short() for name, case in self.cases.items()}
+        rows: dict[str, Any] = {}
+        for name, row in self.rows.items():
+            if row.train is not None and "steps" in row.train:
+                rows[name] = {"train": {"steps": _QUICK["training"]["steps"]}}
+            elif row.train is not None and row.train.get("algorithm") == "cross-entropy":
+                rows[name] = {"train": {"learning": {"candidates": _QUICK_CANDIDATES}}}
+        values = merged(merged(values, {**_QUICK, "cases": cases, "rows": rows}), changes)
+        return make_suite(_without_null(values), label)
 
     def is_for(self, row: str, case: str) -> bool:
         """Return True if a row runs in a case.
@@ -416,11 +474,8 @@ def load_suite(source: str, *, quick: bool = False, allow_code: bool = False) ->
                 raise
             meant = suggestion_or_valid(source, suite_names())
             raise ConfigError(f"{source}: no such suite or file{meant}") from None
-    values = {"name": name} | values
-    if quick:
-        make_suite(values, label)
-        values = _quick(values, label)
-    return make_suite(values, label)
+    suite = make_suite(_extended({"name": name} | values, label), label)
+    return suite.short(label) if quick else suite
 
 
 def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
@@ -436,23 +491,35 @@ def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
     return validated(Suite, values, label)
 
 
-def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Return the values of the short version of a suite.
+def _spread(weeks: Sequence[int], number: int) -> list[int]:
+    """Return at most a number of weeks, spread evenly over those given."""
+    return [*weeks[:: max(len(weeks) // number, 1)][:number]]
+
+
+def _without_null(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a suite without the cases and rows that are null."""
+    kept = {
+        kind: {name: x for name, x in values[kind].items() if x is not None}
+        for kind in ("cases", "rows")
+        if isinstance(values.get(kind), Mapping)
+    }
+    return {**values, **kept}
+
+
+def _extended(values: Mapping[str, Any], label: str) -> dict[str, Any]:
+    """Return the values of a suite on top of those of the suite that it extends, if it does.
 
     Raises:
-        ConfigError: the suite has no short version, or that version names unknown cases or rows.
+        ConfigError: ``extends`` is not the name of a suite of the package.
     """
-    changes = values.get("quick")
-    if not changes:
-        raise ConfigError(f"{label}: has no quick form; valid is one with values in quick")
-    changed = merged({k: v for k, v in values.items() if k != "quick"}, changes)
-    for kind in ("cases", "rows"):
-        for name in changes.get(kind, ()):
-            if name not in values[kind]:
-                meant = suggestion_or_valid(name, values[kind])
-                raise ConfigError(f"{label}: quick.{kind}: no {kind[:-1]} {name!r}{meant}")
-        changed[kind] = {name: x for name, x in changed[kind].items() if x is not None}
-    return changed
+    base = values.get("extends")
+    if base is None:
+        return dict(values)
+    if base not in suite_names():
+        meant = suggestion_or_valid(str(base), suite_names())
+        raise ConfigError(f"{label}: extends {shortened(base)}{meant}")
+    over = {name: value for name, value in values.items() if name != "extends"}
+    return _without_null(merged(load_suite(base)._values(), over))
 
 
 def _without(values: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
