@@ -119,6 +119,7 @@ def done_job(
         metrics=dict(made if metrics is None else metrics),
         files=dict(files or {}),
         core_s=36.0,
+        training_core_s=30.0 if files else 0.0,
         source=source,
         processor={"architecture": "x86_64"},
     )

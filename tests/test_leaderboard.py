@@ -219,3 +219,26 @@ def test_damaged_folders_are_one_line(study: Path, tmp_path: Path) -> None:
         read_suites([store.folder])
     with pytest.raises(SdcError, match=r"study\.json"):
         read_suites([tmp_path / "nothing"])
+
+
+def test_budgets_and_curves_are_means_of_the_seeds_of_trained_rows(
+    study: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(study, copy := tmp_path / "copy")
+    store = ResultStore(copy)
+    for seed in range(3):
+        curve = f"steps,change_pct\n1000,{-1.0 - seed}\n4000,{-3.0 - seed}\n".encode()
+        trainings = {"training": {"steps": 4000, "gradient_steps": 80 + 10 * seed, "updates": 9}}
+        store.keep(
+            done_job("ippo", seed, frames_of_row("ippo", seed), spec=ROWS["ippo"],
+                     files={"validation.csv": curve}, metrics={"trainings": trainings})
+        )  # fmt: skip
+    (suite,) = read_suites([copy])
+    board = leaderboard(suite.cases["two-sites"])
+    standing = by_row(board.standings)
+    columns = ("steps", "gradient_steps", "training_core_s")
+    assert [standing["ippo"][x] for x in columns] == [4000.0, 90.0, 30.0]
+    assert np.isnan(standing["g36"]["steps"])
+    assert board.curves["change_pct"].tolist() == [-2.0, -4.0]
+    assert board.curves["core_s"].tolist() == [7.5, 30.0]
+    assert (board.curves["change_pct_low"] < board.curves["change_pct"]).all()

@@ -107,7 +107,8 @@ def test_tables_pictures_and_cells_of_a_suite(
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     study, out = write_study(tmp_path / "made-up"), tmp_path / "cells"
     store = ResultStore(study)
-    files = {"best/policy.json": b"{}", "training.csv": b"1"}
+    curve = b"steps,change_pct\n1000,-1.0\n2000,-2.0\n"
+    files = {"best/policy.json": b"{}", "validation.csv": curve}
     store.keep(done_job("ippo", 0, frames_of_row("ippo", 0), spec=ROWS["ippo"], files=files))
     publisher.publish([study], docs, out)
     page = (docs / "benchmark.md").read_text("utf-8")
@@ -122,6 +123,10 @@ def test_tables_pictures_and_cells_of_a_suite(
     assert board["change_pct"][0] == pytest.approx(-8.97, abs=0.005)
     assert "(img/benchmark-made-up.webp)" in page
     assert (docs / "img" / "benchmark-made-up.webp").read_bytes()[8:12] == b"WEBP"
+    assert (docs / "img" / "benchmark-made-up-curves.webp").read_bytes()[8:12] == b"WEBP"
+    curves = pd.read_csv(docs / "benchmark" / "made-up-curves.csv")
+    assert curves["core_s"].tolist() == [15.0, 30.0]
+    assert curves["change_pct"].tolist() == [-1.0, -2.0]
     lines = (out / "made-up" / "cells.csv").read_text("utf-8").splitlines()
     assert [line.split(",")[:4] for line in lines[1:]] == [
         ["idle", "idle", "ca", "3"],

@@ -420,6 +420,35 @@ def interval_plot(
     return figure
 
 
+def curve_plot(
+    curves: Mapping[str, Mapping[str, F64]], columns: Mapping[str, str], label: str
+) -> Figure:
+    """Draw learning curves with their intervals, a panel for each measure of effort.
+
+    Args:
+        curves: points of each method: its efforts by column, and ``value``, ``low`` and ``high``,
+            (P,) each, keyed by method.
+        columns: name of each measure of effort, with its unit, by column.
+        label: name of the value, with its unit.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    figure = new_figure(10.0, 4.5)
+    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    for axes, (column, title) in zip(panels, columns.items(), strict=True):
+        for index, (name, points) in enumerate(curves.items()):
+            style = line_style(index)
+            axes.plot(points[column], points["value"], linewidth=1.6, label=literal_text(name),
+                      **style)  # fmt: skip
+            axes.fill_between(points[column], points["low"], points["high"], alpha=0.15,
+                              linewidth=0.0, color=style.get("color"))  # fmt: skip
+        axes.set(xlabel=title)
+    panels[0].set(ylabel=label)
+    style_axes_with_legend(panels[-1])
+    return figure
+
+
 def profile_plot(thresholds: F64, profiles: Mapping[str, F64], label: str) -> Figure:
     """Draw performance profiles after Dolan and Moré (2002).
 

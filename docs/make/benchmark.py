@@ -105,7 +105,7 @@ def tables_of(suite: SuiteResults, boards: dict[str, Leaderboard]) -> dict[str, 
     import pandas as pd
 
     tables = {}
-    for name in ("standings", "sites", "coordination", "apart"):
+    for name in ("standings", "sites", "coordination", "apart", "curves"):
         frames = {case: getattr(board, name) for case, board in boards.items()}
         tables[name] = pd.concat(frames, names=["case"]).reset_index(level=0)
     if suite.suite.accounting == PAPER:
@@ -130,10 +130,10 @@ def section(
     about = f"{weeks_text(board)} {cost_text(suite)} {made_by(suite)}"
     end = f"Complete tables are in {', '.join(files)}. All results were computed with "
     end += f"{', '.join(commands)}. {literal_markdown(about)}"
-    for picture in case_pictures(board)[:1]:
-        path = f"img/benchmark-{suite.name}.webp"
+    for at, picture in enumerate(case_pictures(board)[: 1 if board.curves.empty else 2]):
+        path = f"img/benchmark-{suite.name}{'-curves' * at}.webp"
         write(docs / path, webp(drawn(picture.draw(), 80)))
-        parts.append(f"![Intervals of the rows of suite {suite.name}]({path})")
+        parts.append(f"![{picture.alt.partition(':')[0]}: suite {suite.name}]({path})")
         caption = picture.caption.replace("picture", f"picture of case {board.case.name}", 1)
         end = f"{literal_markdown(caption)} {end}"
     parts.append(end)

@@ -86,6 +86,8 @@ class JobResult:
     """Metrics of the job as a whole; NaN and infinite values become null in JSON."""
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Content of further files, such as a policy, by path relative to the job's folder."""
+    training_core_s: float = 0.0
+    """Processor time of the trainings of the job, in s, which differs between repetitions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,8 @@ class DoneJob:
     """Warnings that the package issued during the job, each in one line."""
     core_s: float = 0.0
     """Processor time of the job, in s."""
+    training_core_s: float = 0.0
+    """Processor time of the trainings of the job, in s."""
     source: str = ""
     """Digest of the package's source files in the process that ran the job."""
     processor: Mapping[str, str] = field(default_factory=dict)
@@ -243,7 +247,12 @@ def _packed(result: JobResult, job: Job) -> dict[str, Any]:
         rows = parquet(result.rows)
     metrics = to_json(result.metrics, inf_nan_mode="null", fallback=lambda array: array.tolist())
     files = {name: bytes(content) for name, content in result.files.items()}
-    return {"rows": rows, "metrics": json.loads(metrics), "files": files}
+    return {
+        "rows": rows,
+        "metrics": json.loads(metrics),
+        "files": files,
+        "training_core_s": result.training_core_s,
+    }
 
 
 def parquet(rows: pd.DataFrame) -> bytes:

@@ -10,6 +10,7 @@ A "figure" is the value of the objective (lower is better).
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from sdc_taichi.benchmark.suite_results import (
     LEARNER,
     RULE,
     CaseResults,
+    RowResult,
     evaluation_of,
 )
 from sdc_taichi.learning.evaluation import IDLE, Evaluation
@@ -70,6 +72,9 @@ BOARD_TITLES = {
     "row": "row",
     "kind": "kind",
     "core_min": "core min",
+    "steps": "training steps",
+    "gradient_steps": "gradient steps",
+    "training_core_s": "training (core s)",
     "parts_pct": "sum of the agents alone (%)",
     "together_pct": "together (%)",
     "worth_points": "coordination (points)",
@@ -82,6 +87,8 @@ _Samples = Mapping[str, tuple[F64, F64]]
 """Objective of each row by seed and week, (S, W), and of idle commands, as from ``samples``."""
 FEWEST = 3
 """Minimum number of weeks per site, and of seeds per trained row, for intervals and ranks."""
+_CURVE = "validation.csv"
+"""File of a training with its results in the validation weeks."""
 _SEED = 0
 _LEAST_POINTS = 1e-9
 """Difference up to which two changes count as equal, in percentage points."""
@@ -110,6 +117,9 @@ class Leaderboard:
     apart: pd.DataFrame
     """Comparison of rows whose agents were trained together with rows whose agents were trained
     separately."""
+    curves: pd.DataFrame
+    """Change against idle commands in the validation weeks, in %, of each trained row during its
+    training, by steps and by core seconds, with 95 % intervals of its seeds."""
     sites: pd.DataFrame
     """Change against idle commands in %, by row and site."""
     best_rule: str
@@ -140,6 +150,7 @@ def leaderboard(case: CaseResults) -> Leaderboard:
         profiles=_profiles(case, evaluation, order),
         coordination=_coordination(case, evaluation, figures),
         apart=_apart(case, evaluation, figures, drawn),
+        curves=_curves(case),
         sites=by_site(evaluation).rename(columns={"controller": "row"}),
         best_rule=best,
     )
@@ -230,9 +241,54 @@ def _standings(
     table["core_min"] = [
         sum(result.record.core_s for result in case.rows[name]) / 60 for name in order
     ]
+    budgets = pd.DataFrame([_budget(case.rows[name]) for name in order], index=order)
+    table = table.join(budgets)
     unknown = [name for name in table if table[name].isna().all()]
     standings: pd.DataFrame = table.drop(columns=unknown).reset_index()
     return standings
+
+
+def _budget(results: Sequence[RowResult]) -> dict[str, float]:
+    """Return means over the seeds of a row: steps, gradient steps and core s of its trainings."""
+    trainings = [result.trainings for result in results]
+    if not any(trainings):
+        return dict.fromkeys(("steps", "gradient_steps", "training_core_s"), math.nan)
+    return {
+        "steps": float(np.mean([sum(x.steps for x in each) for each in trainings])),
+        "gradient_steps": float(np.mean([sum(x.gradient_steps for x in y) for y in trainings])),
+        "training_core_s": float(np.mean([x.record.training_core_s for x in results])),
+    }
+
+
+def _curves(case: CaseResults) -> pd.DataFrame:
+    """Return the validations of trained rows, as means over the seeds with their intervals.
+
+    The core seconds of a training are divided evenly among its steps.
+    """
+    import pandas as pd
+
+    table = []
+    for name, results in case.rows.items():
+        own = [x for x in results if x.submission is None and _CURVE in x.record.files_sha256]
+        if not own:
+            continue
+        curves = [
+            pd.read_csv(io.BytesIO(x.store.file(x.record.partition, _CURVE))).set_index("steps")
+            for x in own
+        ]
+        changes = pd.concat([x["change_pct"] for x in curves], axis=1, join="inner").to_numpy().T
+        core_s = float(np.mean([x.record.training_core_s for x in own]))
+        generator = _generator(name)
+        seeds = generator.integers(len(own), size=(DRAWS, len(own)))
+        for at, steps in enumerate(curves[0].index[: changes.shape[1]]):
+            values = changes[:, at]
+            interval = percentile_interval(float(values.mean()), values[seeds].mean(axis=1))
+            table.append(
+                {"row": name, "seeds": len(own), "steps": int(steps)}
+                | {"core_s": core_s * steps / curves[0].index[-1]}
+                | interval.columns("change_pct")
+            )
+    return pd.DataFrame(table)
 
 
 def _pairs(

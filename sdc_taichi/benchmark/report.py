@@ -38,7 +38,7 @@ from sdc_taichi.learning.evaluation import ALL, IDLE
 from sdc_taichi.learning.evaluation_table import column_samples, literal_markdown
 from sdc_taichi.learning.evaluation_table import markdown as _markdown
 from sdc_taichi.learning.statistics import performance_profile
-from sdc_taichi.viz.fleet_figures import MAX_RUNS, interval_plot, profile_plot
+from sdc_taichi.viz.fleet_figures import MAX_RUNS, curve_plot, interval_plot, profile_plot
 from sdc_taichi.viz.plotting import new_figure
 from sdc_taichi.viz.report_html import html_page, names_text, picture, rendered
 
@@ -380,6 +380,8 @@ def case_pictures(board: Leaderboard) -> list[Picture]:
     pictures: list[Picture] = []
     if picture := _interval_picture(board):
         pictures.append(picture)
+    if not board.curves.empty:
+        pictures.append(_curve_picture(board))
     if not board.profiles.empty:
         pictures.append(_profile_picture(board))
     return pictures
@@ -458,6 +460,26 @@ def _profile_picture(board: Leaderboard) -> Picture:
         f"Performance profiles of {', '.join(shown)}.",
         "Weeks of all seeds in which a row reaches more than a share of the achievable: the higher "
         "the line, the better.",
+    )
+
+
+def _curve_picture(board: Leaderboard) -> Picture:
+    """Return a picture of the validations of trained rows, over steps and over core seconds."""
+    names = {"change_pct": "value", "change_pct_low": "low", "change_pct_high": "high"}
+    curves = {
+        str(name): {x: points[x].to_numpy(np.float64) for x in ("steps", "core_s", *names.values())}
+        for name, points in board.curves.rename(columns=names).groupby("row", sort=False)
+    }
+
+    def draw() -> Figure:
+        efforts = {"steps": "steps of all data centers", "core_s": "core seconds of the training"}
+        return curve_plot(curves, efforts, "change against idle commands, validation weeks (%)")
+
+    return Picture(
+        draw,
+        f"Learning curves of {', '.join(curves)}.",
+        "Validations during the trainings, means of the seeds with 95 % intervals, over steps and "
+        "over core seconds, of which each step has an equal share.",
     )
 
 

@@ -80,7 +80,7 @@ class Study(Record):
 
 
 class ResultRecord(Record):
-    """Content of ``metrics.json``; repetitions of a job differ only in the last two entries."""
+    """Content of ``metrics.json``; repetitions of a job differ only in the last three entries."""
 
     format: Literal["sdc-result/1"]
     """Name and version of the format."""
@@ -106,6 +106,8 @@ class ResultRecord(Record):
     """Metrics of the job as a whole."""
     core_s: Annotated[float, Field(ge=0.0, le=1e12)]
     """Processor time of the job, in s."""
+    training_core_s: Annotated[float, Field(ge=0.0, le=1e12)] = 0.0
+    """Processor time of the trainings of the job, in s."""
     processor: dict[str, Any]
     """Properties of processor and libraries that affect the last bits of the result."""
 
@@ -286,6 +288,7 @@ class ResultStore:
             files_sha256={name: digest_of(done.files[name]) for name in sorted(done.files)},
             metrics=dict(done.metrics),
             core_s=round(done.core_s, 3),
+            training_core_s=round(done.training_core_s, 3),
             processor=dict(done.processor),
         )
         self.write(record, done.rows, done.files)

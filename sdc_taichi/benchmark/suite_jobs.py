@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import time
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -36,6 +37,7 @@ from sdc_taichi.config import validated
 from sdc_taichi.control import make_controller
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, short_name
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.algorithms import gradient_steps
 from sdc_taichi.learning.evaluation import (
     ALL,
     METRICS,
@@ -127,7 +129,7 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
             rows = _rows(task, made, weeks)
             metrics = _metrics(task, made, weeks)
     rows = rows.drop(columns="training").assign(controller=task.name)
-    return JobResult(rows, metrics, made.files)
+    return JobResult(rows, metrics, made.files, made.training_core_s)
 
 
 def packed(files: Mapping[str, bytes], metrics: Mapping[str, Any]) -> bytes:
@@ -224,6 +226,8 @@ class _Made:
     """Content of policies and learning curves of trainings, by path."""
     agents: tuple[str, ...] = ()
     """Agents (load, cooling, battery) that a trained policy controls."""
+    training_core_s: float = 0.0
+    """Processor time of the trainings, in s."""
 
 
 def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
@@ -289,21 +293,25 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
     files: dict[str, bytes] = {}
     metrics: dict[str, Any] = {}
     folders: dict[str, Path] = {}
+    begun_s = time.process_time()
     for agent in agents if task.row.apart else (None,):
         part = AGENT_DEFINITIONS[agent].command if agent else ""
         folder = scratch / "training" / part
         folder.parent.mkdir(parents=True, exist_ok=True)
-        done = train(_settings(task, agent), folder, others=_spec(folders) or None, cache=optima)
+        settings = _settings(task, agent)
+        done = train(settings, folder, others=_spec(folders) or None, cache=optima)
         files |= {
             (Path(part) / name).as_posix(): x for name, x in _files_of_training(folder).items()
         }
         metrics[part or "training"] = {
             "updates": done.updates,
             "steps": done.steps,
+            "gradient_steps": gradient_steps(settings.algorithm, settings.learning, done.updates),
             "validation": None if done.best is None else done.best._asdict(),
         }
         folders[part] = folder
-    return _Made(_spec(folders), {"trainings": metrics}, files, moved)
+    core_s = time.process_time() - begun_s
+    return _Made(_spec(folders), {"trainings": metrics}, files, moved, core_s)
 
 
 def _files_of_training(folder: Path) -> dict[str, bytes]:

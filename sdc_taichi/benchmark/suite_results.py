@@ -28,6 +28,7 @@ from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
 from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation, strata_of
+from sdc_taichi.learning.training_settings import MOST_STEPS
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS
@@ -48,11 +49,22 @@ _SAME = 1e-6
 _Text = Annotated[str, Field(max_length=1000)]
 
 
+class TrainingMetrics(Record):
+    """Metrics of a training that others read."""
+
+    steps: Annotated[int, Field(ge=0, le=MOST_STEPS)]
+    """Number of steps, summed over all data centers."""
+    gradient_steps: Annotated[int, Field(ge=0, le=MOST_STEPS)] = 0
+    """Number of gradient steps of each learner."""
+
+
 class RowMetrics(Record):
     """Metrics of a result of a row that others read; results of other software have none."""
 
     chosen: _Text | None = None
     """Name of the controller that was chosen in the validation weeks."""
+    trainings: dict[_Text, TrainingMetrics] = Field(default={})
+    """Metrics of the training, or of that of each agent."""
 
 
 class SubmissionRecord(Record):
@@ -94,6 +106,11 @@ class RowResult:
     def seed(self) -> int:
         """Seed of the result."""
         return int(self.record.partition["seed"])
+
+    @property
+    def trainings(self) -> list[TrainingMetrics]:
+        """Metrics of the trainings of the result."""
+        return list(RowMetrics.model_validate(self.record.metrics).trainings.values())
 
     @property
     def kind(self) -> str:

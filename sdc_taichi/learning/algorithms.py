@@ -218,6 +218,23 @@ def own_share(reward: Reward | None, default: Reward) -> float:
     return chosen
 
 
+def gradient_steps(name: str, settings: LearningSettings, updates: int) -> int:
+    """Return the number of gradient steps that each learner makes in a training.
+
+    Args:
+        name: name of the algorithm.
+        settings: settings of the algorithm.
+        updates: number of updates; the first one of on-policy algorithms only measures.
+    """
+    match settings:
+        case OnPolicySettings():
+            passes = settings.epochs * settings.mini_batches if ON_POLICY[name].clips else 1
+            return max(updates - 1, 0) * passes
+        case OffPolicySettings():
+            return updates * settings.gradient_steps
+    return 0
+
+
 def uses_state(name: str, settings: LearningSettings) -> bool:
     """Return True if an algorithm's critics take the shared state of all agents as input.
 
