@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+import yaml
 
 from sdc_taichi import build_fleet, make_controller
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, run_job
+from sdc_taichi.benchmark.leaderboard import leaderboard
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.suite import Suite, make_suite
+from sdc_taichi.benchmark.suite_results import read_suites
 from sdc_taichi.benchmark.suite_run import row_jobs, run_suite, study_of
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
 
@@ -94,18 +98,42 @@ def test_agents_trained_apart_act_together(tmp_path: Path) -> None:
         assert (done.files[f"{part}/validation.csv"] == curve) is is_equal
 
 
-def test_policies_run_in_cases_in_which_they_were_not_trained(tmp_path: Path) -> None:
-    away = {"trained_in": "tiny", "weeks": [29]}
-    chosen = make_suite(suite(train=TRAIN, agents_alone=True).model_dump() | {
-        "cases": {"tiny": CASE, "away": away}
-    })  # fmt: skip
-    store = ResultStore(tmp_path)
+def results_of(chosen: Suite, folder: Path) -> ResultStore:
+    """Run a whole suite in this process."""
+    store = ResultStore(folder)
 
     def stage(_: str, jobs: Sequence[Job], __: int, inputs: Inputs | None = None) -> JobSummary:
         return run_jobs(jobs, store, Executor(), inputs)
 
     with store.claimed(study_of(chosen, chosen, "command")):
         run_suite(chosen, store, stage)
+    return store
+
+
+def test_rows_train_with_the_best_settings_of_the_trials(tmp_path: Path) -> None:
+    tuning = {"trials": 3, "steps": 1024, "space": {"ippo": {"rate": [0.01, 0.1, 0.2]}}}
+    chosen = make_suite(suite(train=TRAIN).model_dump() | {"tuning": tuning})
+    store = results_of(chosen, tmp_path)
+    (results,) = read_suites([tmp_path])
+    trials = leaderboard(results.cases["tiny"]).trials
+    assert trials["trial"].tolist() == [0, 1, 2]
+    assert trials["best"].sum() == 1
+    best = json.loads(trials.sort_values("change_pct")["settings"].iloc[0])
+    partition = {"suite": "learners", "case": "tiny", "row": "ippo", "seed": "0"}
+    record = store.result(partition)
+    assert record.metrics["tuned"] == best
+    settings = yaml.safe_load(store.file(partition, "settings.yaml"))
+    assert settings["learning"]["rate"] == best.get("rate", 1e-3)
+    assert settings["learning"]["hidden"] == [8]
+    assert record.training_core_s > 0.0
+
+
+def test_policies_run_in_cases_in_which_they_were_not_trained(tmp_path: Path) -> None:
+    away = {"trained_in": "tiny", "weeks": [29]}
+    chosen = make_suite(suite(train=TRAIN, agents_alone=True).model_dump() | {
+        "cases": {"tiny": CASE, "away": away}
+    })  # fmt: skip
+    store = results_of(chosen, tmp_path)
     rows = store.rows().set_index("case")
     assert rows["week"]["away"].tolist() == [29] * 4
     assert rows["moves"]["away"].tolist() == ["all", "load", "cooling", "battery"]

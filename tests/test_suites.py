@@ -22,7 +22,13 @@ from sdc_taichi.benchmark.suite import (
     make_suite,
     suite_names,
 )
-from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs, run_suite, study_of
+from sdc_taichi.benchmark.suite_run import (
+    reference_jobs,
+    row_jobs,
+    run_suite,
+    study_of,
+    trial_jobs,
+)
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import ForecastError
 from sdc_taichi.errors import SdcError
@@ -300,6 +306,27 @@ def test_cases_change_only_results_of_another_case(
     with pytest.raises(ConfigError) as caught:
         elsewhere(**changes)
     assert message in str(caught.value)
+
+
+def test_settings_are_tried_for_each_algorithm_and_case_of_trainings() -> None:
+    tuning = {"trials": 3, "steps": 20000, "space": {"ippo": {"rate": [0.01, 0.02]}, "ppo": {}}}
+    suite = make_suite(elsewhere().model_dump() | {"tuning": tuning})
+    references = reference_jobs(suite)
+    trials = trial_jobs(suite, references)
+    assert [job.name for job in trials] == [f"small/tiny/trial-ippo/{x}" for x in range(3)]
+    settings = [job.values["row"]["train"] for job in trials]
+    assert [x["steps"] for x in settings] == [20000] * 3
+    assert settings[0]["learning"] == {}
+    assert {x["learning"]["rate"] for x in settings[1:]} <= {0.01, 0.02}
+    rows = {job.name: job for job in row_jobs(suite, references, trials)}
+    names = [job.name for job in trials]
+    assert rows["small/tiny/ippo/1"].values["trials"] == names
+    assert set(names) <= set(rows["small/tiny/ippo/1"].inputs)
+    assert not set(names) & set(rows["small/away/ippo/1"].inputs)
+    assert suite.short("suite").tuning is None
+    wrong = tuning | {"space": {"ippo": {"rate": [0.01, -1.0]}}}
+    with pytest.raises(ConfigError, match=r"tuning\.space\.ippo\.rate: .*got -1"):
+        check_suite(small(tuning=wrong))
 
 
 def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> None:

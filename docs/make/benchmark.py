@@ -105,7 +105,7 @@ def tables_of(suite: SuiteResults, boards: dict[str, Leaderboard]) -> dict[str, 
     import pandas as pd
 
     tables = {}
-    for name in ("standings", "sites", "coordination", "apart", "curves"):
+    for name in ("standings", "sites", "coordination", "apart", "curves", "trials"):
         frames = {case: getattr(board, name) for case, board in boards.items()}
         tables[name] = pd.concat(frames, names=["case"]).reset_index(level=0)
     if suite.suite.accounting == PAPER:

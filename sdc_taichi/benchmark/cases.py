@@ -185,6 +185,20 @@ def check_suite(suite: Suite) -> None:
                     )
             except SdcError as error:
                 raise ConfigError(f"suite {suite.name}: rows.{label}: {error}") from None
+    space = {} if suite.tuning is None else suite.tuning.space
+    case = next(iter(suite.cases.values()))
+    for algorithm, values in space.items():
+        for setting, value in (
+            (name, x) for name, of_setting in values.items() for x in of_setting
+        ):
+            row = Row(train={"algorithm": algorithm, "learning": {setting: value}})
+            try:
+                training_settings(
+                    case, row, objective=suite.objective, seed=0, training=suite.training
+                )
+            except SdcError as error:
+                place = f"suite {suite.name}: tuning.space.{algorithm}.{setting}"
+                raise ConfigError(f"{place}: {error}") from None
 
 
 def _data_center_values(case: Case) -> dict[str, Any]:

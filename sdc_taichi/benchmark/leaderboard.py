@@ -11,6 +11,7 @@ A "figure" is the value of the objective (lower is better).
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdc_taichi.benchmark.suite import TRIAL
 from sdc_taichi.benchmark.suite_results import (
     ACHIEVED,
     BOUND,
@@ -25,6 +27,7 @@ from sdc_taichi.benchmark.suite_results import (
     RULE,
     CaseResults,
     RowResult,
+    TrialMetrics,
     evaluation_of,
 )
 from sdc_taichi.learning.evaluation import IDLE, Evaluation
@@ -72,6 +75,8 @@ BOARD_TITLES = {
     "row": "row",
     "kind": "kind",
     "core_min": "core min",
+    "settings": "settings",
+    "default_pct": "default settings (%)",
     "steps": "training steps",
     "gradient_steps": "gradient steps",
     "training_core_s": "training (core s)",
@@ -120,6 +125,9 @@ class Leaderboard:
     curves: pd.DataFrame
     """Change against idle commands in the validation weeks, in %, of each trained row during its
     training, by steps and by core seconds, with 95 % intervals of its seeds."""
+    trials: pd.DataFrame
+    """Trials of settings: the settings as JSON, the change against idle commands in the validation
+    weeks, in %, and the core seconds of the training; ``best`` is True for the chosen settings."""
     sites: pd.DataFrame
     """Change against idle commands in %, by row and site."""
     best_rule: str
@@ -151,6 +159,7 @@ def leaderboard(case: CaseResults) -> Leaderboard:
         coordination=_coordination(case, evaluation, figures),
         apart=_apart(case, evaluation, figures, drawn),
         curves=_curves(case),
+        trials=_trials(case),
         sites=by_site(evaluation).rename(columns={"controller": "row"}),
         best_rule=best,
     )
@@ -289,6 +298,30 @@ def _curves(case: CaseResults) -> pd.DataFrame:
                 | interval.columns("change_pct")
             )
     return pd.DataFrame(table)
+
+
+def _trials(case: CaseResults) -> pd.DataFrame:
+    """Return the trials of settings, in the order of algorithms and trials."""
+    import pandas as pd
+
+    table = []
+    for record in case.trials:
+        metrics = TrialMetrics.model_validate(record.metrics)
+        table.append(
+            {
+                "algorithm": record.partition["row"].removeprefix(f"{TRIAL}-"),
+                "trial": int(record.partition["seed"]),
+                "settings": json.dumps(metrics.learning, sort_keys=True),
+                "change_pct": metrics.change_pct,
+                "training_core_s": record.training_core_s,
+            }
+        )
+    if not table:
+        return pd.DataFrame()
+    trials = pd.DataFrame(table).sort_values(["algorithm", "trial"], ignore_index=True)
+    best = trials.groupby("algorithm")["change_pct"].idxmin()
+    trials["best"] = trials.index.isin(best)
+    return trials
 
 
 def _pairs(

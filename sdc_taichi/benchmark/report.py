@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections import Counter
@@ -304,6 +305,7 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard, folder: Path) -> list[
         ("What agents save alone, the others idle, and together", board.coordination),
         ("Agents trained together against those trained apart", board.apart),
         ("Change against idle commands by site (%)", board.sites),
+        ("Best settings of the trials, in the validation weeks", _best_trials(board)),
     ]
     blocks += _outage_notes(board)
     pictures = case_pictures(board)
@@ -317,6 +319,17 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard, folder: Path) -> list[
     if recordings := _recordings(case, folder):
         blocks += ["### Recordings", "\n".join(recordings)]
     return blocks
+
+
+def _best_trials(board: Leaderboard) -> pd.DataFrame:
+    """Return the best trial of each algorithm, beside the default settings (trial 0)."""
+    trials = board.trials
+    if trials.empty:
+        return trials
+    default = trials[trials["trial"] == 0].set_index("algorithm")["change_pct"]
+    table = trials[trials["best"]].set_index("algorithm")[["settings", "change_pct"]]
+    table["default_pct"] = default
+    return table.rename_axis("row").reset_index()
 
 
 def _outage_notes(board: Leaderboard) -> list[str]:
@@ -353,6 +366,8 @@ def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
         chosen = results[0].record.metrics.get("chosen")
         parts = [about] if about else []
         parts += [f"chosen in the validation weeks: {chosen}"] if chosen else []
+        tuned = results[0].record.metrics.get("tuned")
+        parts += [f"settings of the best trial: {json.dumps(tuned)}"] if tuned else []
         if parts:
             texts.append(f"{name}: {'; '.join(parts)}")
     return texts

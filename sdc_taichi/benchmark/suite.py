@@ -13,6 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
@@ -22,15 +23,22 @@ from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
-from sdc_taichi.learning.training_settings import SCENARIOS, Year, merged, read_values
+from sdc_taichi.learning.training_settings import (
+    MOST_STEPS,
+    SCENARIOS,
+    Year,
+    merged,
+    read_values,
+)
 from sdc_taichi.optimum.objective import Objective
 
-REFERENCE = "reference"
-"""Name prefix of jobs that compute optima; names of rows must not begin with it."""
+REFERENCE, TRIAL = "reference", "trial"
+"""Name prefixes of jobs that compute optima, and of trials of settings; names of rows must not
+begin with them."""
 Part = Literal["held-out", "validation"]
 """Part of a case: held-out weeks for the results, or validation weeks for choices."""
 _QUICK: Mapping[str, Any] = {
-    "seeds": 2,
+    "seeds": 1,
     "training": {"steps": 100_000, "data_centers": 32, "validation": {"steps": 50_000}},
 }
 """Values of the short version of every suite, beside those that depend on its cases."""
@@ -246,6 +254,36 @@ class Row(Section):
         return any("random" in (parts_of(x).values() or [x]) for x in self.controllers)
 
 
+class Tuning(Section):
+    """Search for settings of trainings, with the same number of trials for each algorithm.
+
+    Trial 0 has the default settings. Each other trial draws a value of each setting. The settings
+    with the best result in the validation weeks are those of all rows of the algorithm.
+    """
+
+    trials: Annotated[int, Field(strict=True, ge=1, le=1000)]
+    """Number of trials of each algorithm in each case, 1..1,000."""
+    steps: Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
+    """Number of steps of a trial, summed over all data centers."""
+    space: dict[str, dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]]]
+    """Values of each setting in section ``learning``, by setting, by algorithm."""
+
+    def learning(self, algorithm: str, trial: int) -> dict[str, Any]:
+        """Return the settings of a trial, which are random but always the same.
+
+        Args:
+            algorithm: name of the algorithm.
+            trial: number of the trial, from 0; trial 0 has the default settings.
+        """
+        seed = np.random.SeedSequence([trial, *algorithm.encode()])
+        generator = np.random.Generator(np.random.PCG64(seed))
+        drawn = {
+            name: values[int(generator.integers(len(values)))]
+            for name, values in self.space[algorithm].items()
+        }
+        return drawn if trial else {}
+
+
 class Suite(Section):
     """Benchmark suite: cases and rows, with the objective and the texts of the result tables."""
 
@@ -265,6 +303,8 @@ class Suite(Section):
     """Number of seeds of rows with randomness, 1..1,000."""
     training: dict[str, Any] = Field(default={})
     """Default settings of all trainings; settings of a row take precedence."""
+    tuning: Tuning | None = None
+    """Search for the settings of trainings; None trains with the settings of the rows alone."""
     cases: dict[Name, Case] = Field(min_length=1)
     """Data centers and weeks in which controllers are compared, by name."""
     rows: dict[Name, Row] = Field(min_length=1)
@@ -272,7 +312,7 @@ class Suite(Section):
     quick: dict[str, Any] = Field(default={})
     """Values that replace others in the short version of the suite, which runs in minutes; the
     value null removes a case or row. By default it has two sites in one year, two weeks of three
-    days and short trainings."""
+    days, short trainings and no tuning."""
 
     @field_validator("objective")
     @classmethod
@@ -291,8 +331,9 @@ class Suite(Section):
     @classmethod
     def _names_are_free(cls, value: dict[str, Row]) -> dict[str, Row]:
         for name in value:
-            if name.startswith(REFERENCE):
-                raise ValueError(f"{name}: valid is a name that does not begin with {REFERENCE}")
+            if name.startswith((REFERENCE, TRIAL)):
+                valid = f"a name that does not begin with {REFERENCE} or {TRIAL}"
+                raise ValueError(f"{name}: valid is {valid}")
         return value
 
     @model_validator(mode="before")
@@ -369,6 +410,7 @@ class Suite(Section):
             ConfigError: ``quick`` names unknown cases or rows, or a value is not valid.
         """
         values = self._values()
+        values.pop("tuning", None)
         changes = values.pop("quick", {})
         for kind in ("cases", "rows"):
             for name in changes.get(kind, ()):

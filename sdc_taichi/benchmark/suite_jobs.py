@@ -13,7 +13,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,7 @@ from sdc_taichi.benchmark.result_table import read_suite_rows
 from sdc_taichi.benchmark.rules_search import best_rules
 from sdc_taichi.benchmark.store import METRICS_FILE, ROWS_FILE, Record
 from sdc_taichi.benchmark.suite import Case, Part, Row
-from sdc_taichi.benchmark.suite_results import RowMetrics
+from sdc_taichi.benchmark.suite_results import RowMetrics, TrialMetrics
 from sdc_taichi.config import validated
 from sdc_taichi.control import make_controller
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, short_name
@@ -47,6 +47,7 @@ from sdc_taichi.learning.evaluation import (
     prepare,
     validate,
 )
+from sdc_taichi.learning.training_settings import merged
 from sdc_taichi.optimum.cache import OptimumCacheWarning
 from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
@@ -119,17 +120,41 @@ def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
     """
     task = _Task.model_validate(values)
     with TemporaryDirectory() as scratch:
-        optima, made_before = Path(scratch) / "optima", Path(scratch) / "made"
-        optima.mkdir()
-        for name, content in inputs.items():
-            with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                archive.extractall(made_before if name == task.made_by else optima)
+        optima = _extracted(inputs, task, Path(scratch))
         made = _made(task, Path(scratch), optima)
         with _weeks(task, "held-out", optima) as weeks:
             rows = _rows(task, made, weeks)
             metrics = _metrics(task, made, weeks)
     rows = rows.drop(columns="training").assign(controller=task.name)
     return JobResult(rows, metrics, made.files, made.training_core_s)
+
+
+def run_trial(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
+    """Train with the settings of a trial, and judge them in the validation weeks.
+
+    Args:
+        values: as for ``run_row``.
+        inputs: optima of the validation weeks, as archives from ``packed``.
+
+    Returns:
+        Result without rows; its metrics are those of the training and its settings ``learning``.
+    """
+    task = _Task.model_validate(values)
+    with TemporaryDirectory() as scratch:
+        made = _trained(task, Path(scratch), _extracted(inputs, task, Path(scratch)))
+    learning = {"learning": (task.row.train or {})["learning"]}
+    return JobResult(None, learning | made.metrics, training_core_s=made.training_core_s)
+
+
+def _extracted(inputs: Inputs, task: _Task, scratch: Path) -> Path:
+    """Extract the inputs of a job into ``optima`` and folders of other jobs; return ``optima``."""
+    optima = scratch / "optima"
+    optima.mkdir()
+    for name, content in inputs.items():
+        is_of_rows = name == task.made_by or name in task.trials
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            archive.extractall(scratch / "inputs" / name if is_of_rows else optima)
+    return optima
 
 
 def packed(files: Mapping[str, bytes], metrics: Mapping[str, Any]) -> bytes:
@@ -175,6 +200,21 @@ def check_reference(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows
         raise ConfigError(f"{ROWS_FILE}: valid is a job of optima without rows")
 
 
+def check_trial(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
+    """Check metrics and table rows that are stored for ``run_trial``.
+
+    Args:
+        metrics: the metrics.
+        rows: the table rows, which must be empty.
+
+    Raises:
+        SdcError: a metric is missing or of another type, or there are rows.
+    """
+    validated(TrialMetrics, metrics, METRICS_FILE)
+    if rows:
+        raise ConfigError(f"{ROWS_FILE}: valid is a trial without rows")
+
+
 def check_row(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
     """Check metrics and table rows that are stored for ``run_row``.
 
@@ -209,6 +249,8 @@ class _Task(BaseModel):
     """Objective by which rows are compared."""
     seed: int
     """Seed of all random numbers."""
+    trials: tuple[str, ...] = ()
+    """Inputs with results of trials, whose best settings the training has."""
     made_by: str | None = None
     """Input with the result of the job that trained or chose the controller; None if this job
     does."""
@@ -233,9 +275,16 @@ class _Made:
 def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
     """Train or choose the controller of a row, if necessary, or take it from another job."""
     if task.made_by is not None:
-        return _made_before(task, scratch / "made")
+        return _made_before(task, scratch / "inputs" / task.made_by)
     if task.row.train is not None:
-        return _trained(task, scratch, optima)
+        folders = [scratch / "inputs" / name for name in task.trials]
+        tried = [json.loads((x / METRICS_FILE).read_text("utf-8")) for x in folders]
+        if not tried:
+            return _trained(task, scratch, optima)
+        best = min(tried, key=lambda metrics: TrialMetrics.model_validate(metrics).change_pct)
+        training = merged(task.training, {"learning": best["learning"]})
+        made = _trained(task.model_copy(update={"training": training}), scratch, optima)
+        return replace(made, metrics=made.metrics | {"tuned": best["learning"]})
     if task.row.best_of is None:
         return _Made(task.row.controller or "", {}, {})
     changes: dict[str, float] = {}

@@ -6,11 +6,12 @@ therefore be compared if they have the same weeks of the same data centers.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,7 +25,7 @@ from sdc_taichi.benchmark.store import (
     ResultStore,
     read_record,
 )
-from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
+from sdc_taichi.benchmark.suite import REFERENCE, TRIAL, Case, Suite, make_suite
 from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation, strata_of
@@ -56,6 +57,25 @@ class TrainingMetrics(Record):
     """Number of steps, summed over all data centers."""
     gradient_steps: Annotated[int, Field(ge=0, le=MOST_STEPS)] = 0
     """Number of gradient steps of each learner."""
+    validation: dict[str, float | None] | None = None
+    """Best result in the validation weeks: ``change_pct``, ``share`` and ``broken_weeks``; None
+    without validation."""
+
+
+class TrialMetrics(Record):
+    """Metrics of a trial of settings that others read."""
+
+    learning: dict[str, Any]
+    """Settings of the trial that differ from the defaults."""
+    trainings: dict[_Text, TrainingMetrics]
+    """Metrics of the training."""
+
+    @property
+    def change_pct(self) -> float:
+        """Change against idle commands in the validation weeks, in %; inf without validation."""
+        (training,) = self.trainings.values()
+        change = (training.validation or {}).get("change_pct")
+        return math.inf if change is None else change
 
 
 class RowMetrics(Record):
@@ -144,6 +164,8 @@ class CaseResults:
     last."""
     missing: tuple[str, ...]
     """Planned results that do not exist yet, as ``ROW, seed SEED``."""
+    trials: Sequence[ResultRecord]
+    """Results of the trials of settings."""
     optima_core_s: float
     """Processor time for computing the optima of the case, in s."""
 
@@ -339,6 +361,7 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
     """Combine the results of one suite from several folders."""
     suite, studies = suite_of(stores[0]), [store.study() for store in stores]
     references: list[ResultRecord] = []
+    trials: list[ResultRecord] = []
     rows: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in suite.cases}
     for store in stores:
         for record in store.results():
@@ -351,12 +374,15 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
                 )
             if row.startswith(REFERENCE):
                 references.append(record)
+            elif row.startswith(TRIAL):
+                validated(TrialMetrics, record.metrics, f"{store.folder_of(record.partition)}")
+                trials.append(record)
             else:
                 _add(rows[case].setdefault(row, {}), read_result(store, record))
     wanted: dict[str, dict[tuple[str, int], None]] = {}
     for partition in (x for study in studies for x in study.partitions):
         check_partition(partition)
-        if not partition["row"].startswith(REFERENCE):
+        if not partition["row"].startswith((REFERENCE, TRIAL)):
             pair = partition["row"], int(partition["seed"])
             wanted.setdefault(partition["case"], {})[pair] = None
     cases = {}
@@ -378,6 +404,7 @@ def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
                 for row, seed in wanted.get(name, ())
                 if seed not in of_case.get(row, {})
             ),
+            trials=[x for x in trials if x.partition["case"] == name],
             optima_core_s=sum(x.core_s for x in solved),
         )
     if not cases:

@@ -5,24 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Protocol, get_args
+from typing import Any, Protocol, get_args
 
 from sdc_taichi.benchmark.cases import data_centers, number_of_seeds, training_steps, years_of
 from sdc_taichi.benchmark.executors import JobSummary
 from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, input_paths, read_input
 from sdc_taichi.benchmark.store import ResultStore, Study
-from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
-from sdc_taichi.benchmark.suite_jobs import check_reference, check_row, packed
+from sdc_taichi.benchmark.suite import REFERENCE, TRIAL, Case, Part, Row, Suite
+from sdc_taichi.benchmark.suite_jobs import check_reference, check_row, check_trial, packed
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.learning.policy import WEIGHTS
+from sdc_taichi.learning.training_settings import merged
 
 _FUNCTIONS = "sdc_taichi.benchmark.suite_jobs"
-OPTIMA, ROWS, OTHER_CASES = "optima", "rows", "rows of other cases"
+OPTIMA, TRIALS, ROWS, OTHER_CASES = "optima", "trials", "rows", "rows of other cases"
 """Names of the stages of a suite's execution; the last one has cases with ``trained_in``."""
 _NOT_OF_OPTIMA = {"about", "rows", "training_weeks", "forecast_error", "trained_in"}
 """Fields of cases on which optima do not depend."""
+_NOT_OF_ROWS = {"about", "seeds", "cases"}
+"""Fields of rows on which their results do not depend."""
+_SEED_OF_TRIALS = 1000
+"""Seed of all trials, which no row has."""
 _MAY_CHANGE = (
     "suite.rows.*",
+    "suite.tuning*",
     "suite.cases.*.rows",
     "suite.title",
     "suite.seeds",
@@ -59,11 +65,13 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
         quick: True for the short version of a suite.
     """
     references = reference_jobs(chosen)
+    trials = trial_jobs(chosen, references)
+    jobs = [*references, *trials, *row_jobs(chosen, references, trials)]
     return Study(
         kind="suite",
         command=command,
         settings={"quick": quick, "suite": suite.model_dump(mode="json", exclude={"quick"})},
-        partitions=[dict(job.partition) for job in [*references, *row_jobs(chosen, references)]],
+        partitions=[dict(job.partition) for job in jobs],
         may_change=_MAY_CHANGE,
     )
 
@@ -109,12 +117,58 @@ def _references(suite: Suite, name: str, part: Part) -> list[Job]:
     return jobs
 
 
-def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
+def trial_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
+    """Return the jobs that try settings of trainings, one for each case, algorithm and trial.
+
+    The other settings of a trial are those of the first row of its algorithm.
+
+    Args:
+        suite: the suite.
+        references: finished jobs that computed the optima of the suite.
+    """
+    jobs: list[Job] = []
+    tuning, names = suite.tuning, {job.key: job.name for job in references}
+    if tuning is None:
+        return jobs
+    for name, case in suite.cases.items():
+        if case.trained_in is not None:
+            continue
+        solved = [x for x in _references(suite, name, "validation") if x.key in names]
+        learners: dict[str, dict[str, Any]] = {}
+        for label, row in suite.rows.items():
+            if suite.is_for(label, name) and row.train is not None:
+                learners.setdefault(row.train["algorithm"], row.train)
+        for algorithm in (x for x in tuning.space if x in learners):
+            for trial in range(tuning.trials):
+                changes = {"steps": tuning.steps, "learning": tuning.learning(algorithm, trial)}
+                train = merged(learners[algorithm], changes)
+                values = {
+                    "name": f"{TRIAL}-{algorithm}",
+                    "case": case.model_dump(mode="json", exclude={"about", "rows"}),
+                    "row": Row(train=train).model_dump(mode="json", exclude=_NOT_OF_ROWS),
+                    "training": suite.training,
+                    "objective": suite.objective,
+                    "seed": _SEED_OF_TRIALS,
+                    **_files(case),
+                }
+                partition = {
+                    "suite": suite.name,
+                    "case": name,
+                    "row": f"{TRIAL}-{algorithm}",
+                    "seed": str(trial),
+                }
+                inputs = {names[x.key]: x.key for x in solved}
+                jobs.append(Job(f"{_FUNCTIONS}:run_trial", values, partition, inputs, check_trial))
+    return jobs
+
+
+def row_jobs(suite: Suite, references: Sequence[Job], trials: Sequence[Job] = ()) -> list[Job]:
     """Return the jobs that run the rows of a suite, one for each case, row and seed.
 
     Args:
         suite: the suite.
         references: finished jobs that computed the optima of the suite.
+        trials: finished jobs that tried settings of trainings.
     """
     jobs: list[Job] = []
     names = {job.key: job.name for job in references}
@@ -140,7 +194,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                 values = {
                     "name": label,
                     "case": case.model_dump(mode="json", exclude={"about", "rows"}),
-                    "row": row.model_dump(mode="json", exclude={"about", "seeds", "cases"}),
+                    "row": row.model_dump(mode="json", exclude=_NOT_OF_ROWS),
                     "training": suite.training if row.train is not None else {},
                     "objective": suite.objective,
                     "seed": seed,
@@ -155,6 +209,13 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                     maker = made_there[min(seed, len(made_there) - 1)]
                     values["made_by"] = maker.name
                     inputs |= {maker.name: maker.key}
+                elif row.train is not None:
+                    tried = name, f"{TRIAL}-{row.train['algorithm']}"
+                    of_row = [
+                        x for x in trials if (x.partition["case"], x.partition["row"]) == tried
+                    ]
+                    values["trials"] = [job.name for job in of_row]
+                    inputs |= {job.name: job.key for job in of_row}
                 job = Job(f"{_FUNCTIONS}:run_row", values, partition, inputs, check_row)
                 made.setdefault((name, label), []).append(job)
                 jobs.append(job)
@@ -175,11 +236,13 @@ def run_suite(suite: Suite, store: ResultStore, run: RunStage) -> None:
     references = reference_jobs(suite)
     if references:
         run(OPTIMA, references, len(references))
-    rows = sorted(row_jobs(suite, references), key=_steps, reverse=True)
+    optima = _packed_results(store, references)
+    if trials := trial_jobs(suite, references):
+        run(TRIALS, trials, len(trials), optima)
+    rows = sorted(row_jobs(suite, references, trials), key=_steps, reverse=True)
     of_others = [job for job in rows if "made_by" in job.values]
     rows = [job for job in rows if "made_by" not in job.values]
-    optima = _packed_results(store, references)
-    run(ROWS, rows, len(rows), optima)
+    run(ROWS, rows, len(rows), {**optima, **_packed_results(store, trials)})
     if of_others:
         makers = {job.values["made_by"] for job in of_others}
         made = _packed_results(store, [job for job in rows if job.name in makers])
