@@ -46,6 +46,7 @@ from .hall_arguments import (
     DONE,
     LANES,
     MODE_VECTORS,
+    MOST_CHANGE_K,
     N_BLOCK_TERMS,
     N_TERMS,
     RUNNING,
@@ -99,13 +100,42 @@ END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
 
 @ti.func
 @no_type_check
+def is_last_sweep(hall: ti.template(), n):
+    """Return True if the present substep ends the step, or if steady air has no further sweep."""
+    done = hall.dcs[n].sweep + 1
+    if ti.static(hall.transient):
+        done = hall.dcs[n].elapsed + hall.dcs[n].length
+    return done >= hall.sweeps
+
+
+@ti.func
+@no_type_check
+def next_length(hall: ti.template(), n, change_k):
+    """Return the length of the next substep, from the change of the air in the present one, in K.
+
+    It is the longest in which air that goes on to change at this rate changes by at most
+    ``MOST_CHANGE_K``, but at most twice the present length. The last substep is what is left.
+    """
+    dc = hall.dcs[n]
+    left, most_k = hall.sweeps - dc.elapsed, ti.cast(MOST_CHANGE_K, ti.f64) * dc.length
+    most = ti.min(ti.min(hall.longest, 2 * dc.length), left)
+    length = 1
+    while length < most and change_k * (length + 1) <= most_k:
+        length += hall.one
+    return length
+
+
+@ti.func
+@no_type_check
 def describe_sweep(hall: ti.template(), n, slice_at, exchanges_after, reference_c):
     """Return the state of a data center before a sweep, as a struct for functions of the sweep."""
     dc = hall.dcs[n]
     sweep = ti.Struct(
         is_first=dc.sweep == 0,
         # In steady air, the last sweep is known only once the sweeps have converged.
-        is_last=dc.sweep == hall.sweeps - 1,
+        is_last=is_last_sweep(hall, n),
+        # Factor of the results of this substep in sums over the step.
+        length=ti.cast(dc.length, hall.real),
         # True: exchange the exhausts before computing the racks (or after them).
         exchanges_before=dc.exchanges_before != 0,
         exchanges_after=exchanges_after,
@@ -259,7 +289,7 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     """Run the CRAC units at the racks' need; set status and next mixes of the data center."""
     dc = hall.dcs[n]
     total, sweep = hall.chunks[dc.first_chunk], dc.sweep
-    is_last = sweep + 1 >= hall.sweeps
+    is_last = is_last_sweep(hall, n)
     moved_k = ti.cast(0.0, ti.f64)
     if dc.inlet_target_c > 0.0:
         moved_k = follow_hottest_inlet(hall, n, total.present_inlet_max_c)
@@ -292,6 +322,8 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
         air.units_load_w, air.coil_w = run_coils(hall, n, units, air.units_return_c)
         air.casings_w = units.casings_w
         most_k = change_of_air(hall, n, total.least_change_k, total.most_change_k)
+        dc.elapsed = dc.elapsed + dc.length
+        dc.length = next_length(hall, n, most_k)
         if sweep > 0:
             most_k = ti.max(most_k, dc.most_change_k)
         dc.most_change_k = most_k
@@ -317,9 +349,9 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
 
 @ti.func
 @no_type_check
-def running_mean(hall: ti.template(), is_first, before, value):
+def running_mean(hall: ti.template(), is_first, weight, before, value):
     """Return the mean over the substeps so far, added to ``before``; in steady air ``value``."""
-    mean = value * hall.weight
+    mean = value * weight
     if not is_first:
         mean += before
     return mean
@@ -327,18 +359,18 @@ def running_mean(hall: ti.template(), is_first, before, value):
 
 @ti.func
 @no_type_check
-def store_air(hall: ti.template(), n, is_first, air: ti.template()):
+def store_air(hall: ti.template(), n, is_first, weight, air: ti.template()):
     """Store supply and return air of the CRAC units, and heat at their coils, in DC_OUT."""
     dc = hall.dcs[n]
     supplied_m3k_s = hall.chunks[dc.first_chunk].flow_m3s * air.supply_c
-    dc.inlet_m3k_s = running_mean(hall, is_first, dc.inlet_m3k_s, supplied_m3k_s)
-    dc.units_flow_m3s = running_mean(hall, is_first, dc.units_flow_m3s, air.units_flow_m3s)
-    dc.supply_c = running_mean(hall, is_first, dc.supply_c, air.supply_c)
-    dc.units_return_c = running_mean(hall, is_first, dc.units_return_c, air.units_return_c)
-    dc.units_load_w = running_mean(hall, is_first, dc.units_load_w, air.units_load_w)
-    dc.coil_w = running_mean(hall, is_first, dc.coil_w, air.coil_w)
+    dc.inlet_m3k_s = running_mean(hall, is_first, weight, dc.inlet_m3k_s, supplied_m3k_s)
+    dc.units_flow_m3s = running_mean(hall, is_first, weight, dc.units_flow_m3s, air.units_flow_m3s)
+    dc.supply_c = running_mean(hall, is_first, weight, dc.supply_c, air.supply_c)
+    dc.units_return_c = running_mean(hall, is_first, weight, dc.units_return_c, air.units_return_c)
+    dc.units_load_w = running_mean(hall, is_first, weight, dc.units_load_w, air.units_load_w)
+    dc.coil_w = running_mean(hall, is_first, weight, dc.coil_w, air.coil_w)
     casings_w = dc.thermal_storage_w
-    dc.thermal_storage_w = running_mean(hall, is_first, casings_w, air.casings_w)
+    dc.thermal_storage_w = running_mean(hall, is_first, weight, casings_w, air.casings_w)
 
 
 @ti.func
@@ -377,7 +409,14 @@ def store_results(hall: ti.template(), n):
 
 @ti.func
 @no_type_check
-def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hottest: ti.template()):
+def finish_sweep(
+    hall: ti.template(),
+    n,
+    terms_at,
+    is_one_chunk,
+    sweep: ti.template(),
+    hottest: ti.template(),
+):
     """Finish a sweep after the last chunk of a data center; store results if it was the last."""
     combine_chunks(hall, n)
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
@@ -394,10 +433,10 @@ def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hotte
         update_crac_and_convergence(hall, n, air)
         is_done = dc.status != RUNNING
     if ti.static(hall.transient):
-        store_air(hall, n, is_first, air)
+        store_air(hall, n, sweep.is_first, hall.weight * ti.cast(sweep.length, ti.f64), air)
     if is_done:
         if ti.static(not hall.transient):
-            store_air(hall, n, True, air)
+            store_air(hall, n, True, hall.weight, air)
             if is_one_chunk:
                 sum_chunk(hall, dc.first_chunk, terms_at, 0, FIRST_OF_SWEEP, False)
                 find_hottest_rack(hall, dc.first_chunk, hottest, False)
@@ -436,10 +475,10 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
             else:
                 set_mode_amounts(hall, n, slice_at, reference_c)
     servers = server_model(hall, n)
-    warming = warming_model(hall, n, servers)
     hottest = no_hottest(hall)
     while sweeps_left > 0 and dc.status == RUNNING:
         sweep = describe_sweep(hall, n, slice_at, exchanges_after, reference_c)
+        warming = warming_model(hall, n, servers)
         if ti.static(hall.recirculates):
             if dc.shares_due > 0.0 or dc.exceeds > 0.0:
                 set_present_shares(hall, n, first_chunk, end_chunk)
@@ -462,7 +501,7 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
                 if exchanges_after:
                     exchange_dense(hall, n, chunk_at, reference_c)
             if is_last_chunk(hall, n, n_chunks):
-                finish_sweep(hall, n, terms_at, n_chunks == 1, sweep.is_first, hottest)
+                finish_sweep(hall, n, terms_at, n_chunks == 1, sweep, hottest)
             if ti.static(hall.recirculates and not hall.transient):
                 if exchanges_after and dc.status == RUNNING:
                     add_feedback(hall, n, chunk_at)

@@ -32,6 +32,8 @@ SPARSE_LANES = 16
 """Source racks in one vector of weights of sparse halls; it serves all lanes of a block."""
 SPARSE_BLOCKS = SPARSE_LANES // LANES
 """Blocks per vector of SPARSE_LANES racks."""
+MOST_CHANGE_K = 0.5
+"""Change of the air of a hall in a substep, in K, above which substeps become shorter."""
 CHUNK_BLOCKS = 16
 """Maximum number of blocks in a chunk; fewer racks do not justify a thread."""
 RANKS_PER_K = 2.0**27
@@ -94,6 +96,8 @@ DC_CONTROL = {
     "exchanges_before": "1 if the next sweep starts with an exchange (sparse or transient)",
     "exhaust_side": "array that the last exchange read: exhaust_c (0) or exhaust_odd_c (1)",
     "sweep": "number of sweeps or substeps since the start of the step",
+    "elapsed": "time since the start of the step divided by substep_s (transient)",
+    "length": "length of the present substep divided by substep_s (transient)",
     "chunks_done": "number of chunks that have finished the present sweep",
 }
 RUNNING, DONE, NOT_CONVERGED = 1, 0, -1
@@ -351,13 +355,14 @@ ARGUMENTS = {
     "serial": Argument("template"),  # True: run on the calling thread alone
     "slices": Argument("i32"),  # number of parts, one thread each
     "one": Argument("i32"),  # always 1, see "Loops of step 1" in README.md
-    "sweeps": Argument("i32"),  # maximum number of sweeps, or number of substeps
+    "sweeps": Argument("i32"),  # maximum number of sweeps, or of substeps
+    "longest": Argument("i32"),  # length of the longest substep divided by substep_s
     "outlet_model": Argument("i32"),  # index into OUTLETS
     "load_level": Argument("i32"),  # LOADS_PER_DC, LOADS_PER_RACK or LOADS_PER_GROUP
     "load_columns": Argument("i32"),  # number of loads in the table of steady states
     "per_group": Argument("i32"),  # 1 if layers hold one server per group
-    "substep_s": Argument("f64"),
-    "weight": Argument("f64"),  # weight of a sweep in the results: 1 / substeps
+    "substep_s": Argument("f64"),  # length of the shortest substep
+    "weight": Argument("f64"),  # weight of a sweep or shortest substep in the results
     "tolerance_k": Argument("f64"),  # convergence: limit of the change of any mix
     "abandoned_above_k": Argument("f64"),  # transient: change of the air that ends a step early, K
     # Indices of the items in the arrays.
@@ -420,7 +425,15 @@ _LAYERS_ALONE = (
     *("inlet_vectors", "outlet_vectors", "power_vectors"),
 )
 _STEP_ALONE = (
-    *("sweeps", "load_columns", "substep_s", "weight", "tolerance_k", "abandoned_above_k"),
+    *(
+        "sweeps",
+        "longest",
+        "load_columns",
+        "substep_s",
+        "weight",
+        "tolerance_k",
+        "abandoned_above_k",
+    ),
     "task_offsets",
     *(
         "source_offsets",

@@ -39,7 +39,7 @@ from .hall_arguments import (
     SPARSE_BLOCKS,
     SPARSE_LANES,
 )
-from .sums import store_change_range
+from .sums import present_substep_s, store_change_range
 
 EXHAUST_ROW = row_index(RACK_STATE, "exhaust_c")
 """Row of side 0 of the exhausts; the next row is side 1."""
@@ -337,7 +337,7 @@ def parcel_model(hall: ti.template(), n, chunk_at, servers: ti.template()):
     """
     dc = hall.dcs[n]
     parcel_j_per_k = dc.parcel_j_per_k
-    step_s = ti.cast(hall.substep_s, hall.real)
+    step_s = ti.cast(present_substep_s(hall, n), hall.real)
     per_m3 = servers.air_j_per_m3_k / parcel_j_per_k
     crac_m3s = ti.cast(dc.crac_m3s_per_rack, hall.real)
     still_per_s = ti.min(hall.real(STILL_PER_S), servers.air_j_per_m3_k * crac_m3s / parcel_j_per_k)

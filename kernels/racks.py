@@ -133,12 +133,13 @@ def compute_block(
         # SHI and RHI are computed from rack outlets, with the outlet model of the hall.
         sums.inlet_m3k_s = flow_m3s * mean_c
         outlet_m3k_s = flow_m3s * outlet_c
-    terms.inlet_m3k_s = terms.inlet_m3k_s + sums.inlet_m3k_s
-    terms.outlet_m3k_s = terms.outlet_m3k_s + outlet_m3k_s
+    terms.inlet_m3k_s = terms.inlet_m3k_s + sweep.length * sums.inlet_m3k_s
+    terms.outlet_m3k_s = terms.outlet_m3k_s + sweep.length * outlet_m3k_s
     terms.flow_m3s = terms.flow_m3s + flow_m3s
-    add_degrees_out_of_range(hall, block_at, terms_at, racks, air, extremes)
+    add_degrees_out_of_range(hall, block_at, terms_at, sweep, racks, air, extremes)
     if ti.static(hall.transient):
-        terms.thermal_storage_w = terms.thermal_storage_w + (thermal_storage_w + parcel_w)
+        stored_w = sweep.length * (thermal_storage_w + parcel_w)
+        terms.thermal_storage_w = terms.thermal_storage_w + stored_w
     else:
         terms.outlet_sum_c = terms.outlet_sum_c + outlet_c
 
@@ -256,6 +257,7 @@ def add_degrees_out_of_range(
     hall: ti.template(),
     block_at,
     terms_at,
+    sweep: ti.template(),
     racks: ti.template(),
     air: ti.template(),
     extremes: ti.template(),
@@ -277,8 +279,8 @@ def add_degrees_out_of_range(
             over_27_sum_k += group.count * larger(inlet_c - high_c, hall.zeros)
             under_18_sum_k += group.count * larger(low_c - inlet_c, hall.zeros)
             z += hall.one
-        terms.over_27_sum_k = terms.over_27_sum_k + over_27_sum_k
-        terms.under_18_sum_k = terms.under_18_sum_k + under_18_sum_k
+        terms.over_27_sum_k = terms.over_27_sum_k + sweep.length * over_27_sum_k
+        terms.under_18_sum_k = terms.under_18_sum_k + sweep.length * under_18_sum_k
 
 
 @ti.func
@@ -290,6 +292,11 @@ def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti
     """
     block = hall.blocks[block_at]
     if ti.static(hall.transient):
+        results.cpu_w *= sweep.length
+        results.fan_w *= sweep.length
+        results.airflow_m3s *= sweep.length
+        results.inlet_c *= sweep.length
+        results.outlet_c *= sweep.length
         if not sweep.is_first:
             results.cpu_w += block.cpu_w
             results.fan_w += block.fan_w

@@ -17,6 +17,7 @@ import taichi as ti
 from .compiler.functions import larger, smaller
 from .decay import halvings_for, phi1, power_of_half
 from .hall_arguments import LANES, LOADS_PER_GROUP, LOADS_PER_RACK, OUTLETS
+from .sums import present_substep_s
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 STILL_AIR_SHARE = 0.02
@@ -389,7 +390,7 @@ def warming_model(hall: ti.template(), n, servers: ti.template()):
     T - T_in that the air takes up. The solution is exact: T(t) - T(0) = phi1(x) (P/C t - x (T(0) -
     T_in)) with x = eps K t / C.
     """
-    dc, step_s = hall.dcs[n], ti.cast(hall.substep_s, hall.real)
+    dc, step_s = hall.dcs[n], ti.cast(present_substep_s(hall, n), hall.real)
     server_j_per_k = dc.server_j_per_k
     k_per_w, halvings = step_s / server_j_per_k, 0
     if ti.static(hall.transient):

@@ -23,6 +23,13 @@ END_OF_TERMS = FIRST_TERM + len(TERMS)
 
 @ti.func
 @no_type_check
+def present_substep_s(hall: ti.template(), n):
+    """Return the length of the present substep of a data center, in s."""
+    return hall.substep_s * ti.cast(hall.dcs[n].length, ti.f64)
+
+
+@ti.func
+@no_type_check
 def sum_lanes(lanes):
     """Return the sum over the lanes of a vector, in f64."""
     total = ti.cast(0.0, ti.f64)

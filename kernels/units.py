@@ -8,7 +8,7 @@ from .compiler.functions import larger
 from .decay import halvings_for, phi1, power_of_half
 from .hall_arguments import COVERED_WITHIN, LANES, MOST_SUPPLY_RATIO, N_BLOCK_TERMS
 from .servers import first_share_at
-from .sums import sum_lanes
+from .sums import present_substep_s, sum_lanes
 
 USUAL_RISE_K = 15.0
 """Typical temperature rise of air through servers, in K, for the gain of the fan control."""
@@ -461,11 +461,11 @@ def blow_out_casings(hall: ti.template(), n):
     V_casing dT/dt = V_k (T_coil - T). With x = V_k t / V_casing, the exact mean of a substep is
     T_coil + (T(0) - T_coil) (1 - exp(-x)) / x. ``V_k`` is the airflow of the substep before.
     """
-    at = hall.dcs[n].first_unit
+    at, substep_s = hall.dcs[n].first_unit, present_substep_s(hall, n)
     while at < hall.dcs[n + 1].first_unit:
         unit = hall.units[at]
         flow_m3s = ti.cast(unit.design_m3s, ti.f64) * unit.speed
-        x = ti.cast(flow_m3s * hall.substep_s, hall.real) / unit.casing_m3
+        x = ti.cast(flow_m3s * substep_s, hall.real) / unit.casing_m3
         halvings = halvings_for(hall, x)
         part = power_of_half(hall, halvings)
         phi = phi1(hall, x * part, halvings) * part
@@ -525,6 +525,7 @@ def run_crac_units(hall: ti.template(), n, is_last):
     )
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
     fresh_share, exceeds = ti.cast(dc.fresh_share, ti.f64), none
+    substep_s, weight = present_substep_s(hall, n), hall.weight * ti.cast(dc.length, ti.f64)
     at = dc.first_unit
     while at < hall.dcs[n + 1].first_unit:
         unit = hall.units[at]
@@ -562,13 +563,13 @@ def run_crac_units(hall: ti.template(), n, is_last):
         if is_running > 0.0:
             units.any_running = ti.cast(1.0, ti.f64)
         if ti.static(hall.transient):
-            casing_w = air * ti.cast(unit.casing_m3, ti.f64) * unit.casing_change_k / hall.substep_s
+            casing_w = air * ti.cast(unit.casing_m3, ti.f64) * unit.casing_change_k / substep_s
             units.casings_w += casing_w
             units.running_casings_w += is_running * casing_w
             unit.casing_c = unit.casing_c + unit.casing_change_k
-            flow *= hall.weight
-            cubed *= hall.weight
-            mean_supply_c *= hall.weight
+            flow *= weight
+            cubed *= weight
+            mean_supply_c *= weight
             if dc.sweep > 0:
                 flow += unit.flow_m3s
                 cubed += unit.cubed_speed
@@ -611,7 +612,7 @@ def follow_hottest_inlet(hall: ti.template(), n, inlet_c):
     gain = (1.0 - low) * (over_supply_k + USUAL_RISE_K) / (ti.max(s, low) * band_k)
     step = (wanted - s) / (1.0 + gain)
     if ti.static(hall.transient):
-        step *= ti.min(hall.substep_s / FAN_RAMP_S, 1.0)
+        step *= ti.min(present_substep_s(hall, n) / FAN_RAMP_S, 1.0)
     dc.fan_speed = s + step
     return ti.abs(wanted - s) * band_k
 
@@ -756,7 +757,7 @@ def plant_limit_w(hall: ti.template(), n, running_w, offered_w, j_per_k):
     """
     dc = hall.dcs[n]
     limit_w = dc.coil_limit_w + dc.limit_w_per_w * ti.max(running_w, 0.0)
-    gain = dc.limit_w_per_k * hall.substep_s / j_per_k
+    gain = dc.limit_w_per_k * present_substep_s(hall, n) / j_per_k
     more_w = ti.max(offered_w - limit_w, 0.0) * (gain / (1.0 + gain))
     return ti.max(limit_w + more_w, 0.0)
 
@@ -778,7 +779,7 @@ def share_with_water(hall: ti.template(), n, running_w, wanted_w):
         running_w: heat from return air and fans that reaches the running coils, in W.
         wanted_w: this heat and the heat stored in the room, at least 0, in W.
     """
-    dc, h = hall.dcs[n], hall.substep_s
+    dc, h = hall.dcs[n], present_substep_s(hall, n)
     carried_w = ti.max(dc.carried_w, dc.coil_limit_w)
     load_w = ti.min(wanted_w, carried_w) + dc.water_j / h
     recharge_w = ti.select(dc.tank_share > 0.0, dc.tank_j / h, 0.0)
@@ -809,7 +810,7 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
     brings supply air back to its setpoint, up to the limit of the plant. The room and the chilled
     water store the rest, which warms the supply air of the next substep.
     """
-    dc = hall.dcs[n]
+    dc, substep_s = hall.dcs[n], present_substep_s(hall, n)
     air = ti.cast(dc.air_j_per_m3_k, ti.f64)
     fans_w = units.fan_m3s * dc.crac_fan_w_per_m3s
     load_w = air * (return_c * units.flow_m3s - units.supply_m3k_s) + fans_w - units.casings_w
@@ -823,12 +824,12 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
                 flow_m3s = ti.cast(unit.design_m3s * unit.running, ti.f64) * unit.speed
                 running_w += air * flow_m3s * unit.return_offset_k
                 at += hall.one
-    wanted_w = ti.max(running_w + units.any_running * dc.room_j / hall.substep_s, 0.0)
+    wanted_w = ti.max(running_w + units.any_running * dc.room_j / substep_s, 0.0)
     plant_w = ti.min(wanted_w, plant_limit_w(hall, n, running_w, wanted_w, dc.room_j_per_k))
     coil_w = plant_w
     if dc.water_j_per_k > 0.0 and dc.carried_w > 0.0:
         plant_w, coil_w = share_with_water(hall, n, running_w, wanted_w)
-    room_j = dc.room_j + (load_w - coil_w) * hall.substep_s
+    room_j = dc.room_j + (load_w - coil_w) * substep_s
     dc.room_j = room_j
     warmed_k = room_j / dc.room_j_per_k
     if dc.adjusts_supply > 0.0:

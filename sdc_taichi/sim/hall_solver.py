@@ -30,6 +30,7 @@ from sdc_taichi.kernels.hall_arguments import (
     LOADS_PER_GROUP,
     LOADS_PER_RACK,
     MODE_VECTORS,
+    MOST_CHANGE_K,
     MOST_SUPPLY_RATIO,
     NOT_CONVERGED,
     OUTLETS,
@@ -65,6 +66,8 @@ _FIRST_CONTROL = [
                 # There are two exhaust buffers: a sweep reads what the sweep before it wrote.
                 "exhaust_side": exchanges_before,
                 "sweep": 0,
+                "elapsed": 0,
+                "length": 1,
                 "chunks_done": 0,
             },
         ),
@@ -160,8 +163,8 @@ SLICES_PER_THREAD = 8
 """Number of work slices per thread; several slices balance the load of the threads."""
 TOLERANCE_K: dict[Precision, float] = {"f32": 2e-4, "f64": 1e-12}
 """Convergence tolerance in K: change of the exhaust mix before any rack by a further sweep."""
-MOST_CHANGE_K = 0.5
-"""Change of the air in a substep, in K, above which a step is repeated with shorter substeps."""
+MOST_LENGTHENED = 4
+"""Longest substep of a step with abrupt changes, divided by its shortest substep."""
 SAMPLE_TOLERANCE_K: dict[Precision, float] = {"f32": 5e-5, "f64": 1e-8}
 """Convergence tolerance of sampled racks in K, small enough that large halls rarely need a second
 sweep for it."""
@@ -429,11 +432,13 @@ class Hall:
         *,
         shortest_s: float | None = None,
     ) -> tuple[HallSums, HallState]:
-        """Advance transient halls by one step, in equal substeps of at most ``substep_s``.
+        """Advance transient halls by one step, in substeps of at most ``substep_s``.
 
         Exhausts act on the racks one substep later, so abrupt changes need short substeps. A data
-        center whose air changes by more than ``MOST_CHANGE_K`` in a substep (``change_of_air`` of
-        the kernels) repeats the step with substeps that are shorter by this ratio.
+        center whose air changes by more than ``MOST_CHANGE_K`` in one of equal substeps
+        (``change_of_air`` of the kernels) repeats the step with substeps that are shorter by this
+        ratio. If this calls for the shortest, the step begins with those, and they become longer
+        where the air changes less.
 
         Args:
             conditions: Load and failures; the supply temperature follows from ``coil``.
@@ -441,7 +446,7 @@ class Hall:
             coil: Setpoints, heat stored in the room, and the limit of the plant.
             step_s: Length of the step, in s.
             substep_s: Maximum length of a substep, in s.
-            shortest_s: Length down to which substeps of repeated steps are shortened, in s; None
+            shortest_s: Maximum length of the shortest substep of a repeated step, in s; None
                 repeats no step.
 
         Returns:
@@ -454,7 +459,7 @@ class Hall:
         after = np.empty(self._fleet.groups, self._dtype)
 
         def advance(
-            chosen: npt.NDArray[np.bool_], substeps: int, abandoned_above_k: float = np.inf
+            chosen: npt.NDArray[np.bool_], substeps: int, longest: int, abandoned_above_k: float
         ) -> None:
             self._set_state(state, coil, chosen)
             self._begin_step(exchanges_before=1, chosen=chosen)
@@ -462,6 +467,7 @@ class Hall:
                 dc_out,
                 substeps,
                 transient=True,
+                longest=longest,
                 substep_s=step_s / substeps,
                 weight=1.0 / substeps,
                 abandoned_above_k=abandoned_above_k,
@@ -475,15 +481,17 @@ class Hall:
         substeps, every_dc = count(substep_s), np.ones(self._fleet.size, np.bool_)
         most = substeps if shortest_s is None else count(shortest_s)
         if most <= substeps:
-            advance(every_dc, substeps)
-        else:
-            # A step that will be repeated with the shortest substeps need not be finished.
-            advance(every_dc, substeps, MOST_CHANGE_K * (np.ceil(most / substeps) - 1.0))
-            ratio = np.ceil(self._dc["most_change_k"] / MOST_CHANGE_K)
-            # Halls whose temperatures are not numbers are beyond all limits.
-            needed = np.nan_to_num(np.minimum(substeps * ratio, most))
-            for finer in np.unique(needed[needed > substeps]).tolist():
-                advance(needed == finer, int(finer))
+            advance(every_dc, substeps, 1, np.inf)
+            return self._results(dc_out, transient=True), self._hall_state(after)
+        # A step that will be repeated with the shortest substeps need not be finished.
+        advance(every_dc, substeps, 1, MOST_CHANGE_K * (np.ceil(most / substeps) - 1.0))
+        ratio = np.ceil(self._dc["most_change_k"] / MOST_CHANGE_K)
+        # Halls whose temperatures are not numbers are beyond all limits.
+        needed = np.nan_to_num(np.minimum(substeps * ratio, most))
+        for finer in np.unique(needed[needed > substeps]).tolist():
+            # Only part of a step needs the shortest substeps.
+            longest = min(most // substeps, MOST_LENGTHENED) if finer == most else 1
+            advance(needed == finer, int(finer), longest, np.inf)
         return self._results(dc_out, transient=True), self._hall_state(after)
 
     def steady_state(self, conditions: Conditions) -> HallState:
@@ -933,6 +941,7 @@ class Hall:
         *,
         transient: bool = False,
         sweeps: int = 1,
+        longest: int = 1,
         substep_s: float = 1.0,
         weight: float = 1.0,
         abandoned_above_k: float = np.inf,
@@ -951,6 +960,7 @@ class Hall:
             transient=transient,
             serial=group_places * LANES * (sweeps if transient else 1) <= self._serial_groups,
             sweeps=sweeps,
+            longest=longest,
             load_level=self._load_level,
             substep_s=substep_s,
             weight=weight,
