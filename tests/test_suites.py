@@ -17,6 +17,7 @@ from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import Inputs, Job
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.suite import (
+    Case,
     Suite,
     load_suite,
     make_suite,
@@ -247,6 +248,7 @@ def test_the_test_may_be_of_other_data_centers() -> None:
 
 def test_errors_of_forecasts_are_those_of_a_case_and_share_its_optima() -> None:
     tiny = SMALL["cases"]["tiny"]
+    tiny = {**tiny, "weeks": [0], "training_weeks": [3]}
     noisy = {**tiny, "forecast_error": "ci=0.1,temperature=1", "rows": ["idle", "ippo", "bound"]}
     suite = small(cases={"tiny": tiny, "noisy": noisy})
     settings = training_settings(
@@ -259,6 +261,7 @@ def test_errors_of_forecasts_are_those_of_a_case_and_share_its_optima() -> None:
     of_noisy = [job for job in jobs if job.partition["case"] == "noisy"]
     assert [job.partition["row"] for job in of_noisy] == ["idle"] * 2 + ["ippo"] * 2 + ["bound"]
     assert of_noisy[-1].inputs == next(x for x in jobs if x.name == "small/tiny/bound/0").inputs
+    assert all(Case.model_validate(job.values["case"]) for job in references)
     alone = suite.chosen(cases=["noisy"], rows=["bound"])
     assert {job.partition["case"] for job in reference_jobs(alone)} == {"noisy"}
 

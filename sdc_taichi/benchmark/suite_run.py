@@ -20,7 +20,7 @@ from sdc_taichi.learning.training_settings import merged
 _FUNCTIONS = "sdc_taichi.benchmark.suite_jobs"
 OPTIMA, TRIALS, ROWS, OTHER_CASES = "optima", "trials", "rows", "rows of other cases"
 """Names of the stages of a suite's execution; the last one has cases with ``trained_in``."""
-_NOT_OF_OPTIMA = {"about", "rows", "training_weeks", "forecast_error", "trained_in"}
+_NOT_OF_OPTIMA = {"about", "rows", "forecast_error", "trained_in"}
 """Fields of cases on which optima do not depend."""
 _NOT_OF_ROWS = {"about", "seeds", "cases"}
 """Fields of rows on which their results do not depend."""
@@ -64,16 +64,24 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
         command: command line that runs or resumes the suite.
         quick: True for the short version of a suite.
     """
-    references = reference_jobs(chosen)
-    trials = trial_jobs(chosen, references)
-    jobs = [*references, *trials, *row_jobs(chosen, references, trials)]
     return Study(
         kind="suite",
         command=command,
         settings={"quick": quick, "suite": suite.model_dump(mode="json", exclude={"quick"})},
-        partitions=[dict(job.partition) for job in jobs],
+        partitions=[dict(job.partition) for job in planned_jobs(chosen)],
         may_change=_MAY_CHANGE,
     )
+
+
+def planned_jobs(suite: Suite) -> list[Job]:
+    """Return all jobs of a suite: optima, trials of settings, and rows.
+
+    Args:
+        suite: the suite.
+    """
+    references = reference_jobs(suite)
+    trials = trial_jobs(suite, references)
+    return [*references, *trials, *row_jobs(suite, references, trials)]
 
 
 def reference_jobs(suite: Suite) -> list[Job]:

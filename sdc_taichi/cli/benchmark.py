@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,7 @@ from sdc_taichi.cli.options import (
     force_option,
     out_option,
 )
-from sdc_taichi.cli.terminal import print_notes, stage_bars
+from sdc_taichi.cli.terminal import duration, print_notes, stage_bars
 from sdc_taichi.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -93,9 +94,10 @@ def run_command(
     The result of each job is stored, so --resume runs what is missing.
     """
     from sdc_taichi.benchmark.cases import check_suite
+    from sdc_taichi.benchmark.estimate import core_s_of
     from sdc_taichi.benchmark.store import ResultStore
     from sdc_taichi.benchmark.suite import load_suite
-    from sdc_taichi.benchmark.suite_run import run_suite, study_of
+    from sdc_taichi.benchmark.suite_run import planned_jobs, run_suite, study_of
 
     whole = load_suite(suite, quick=quick)
     chosen = whole.chosen(cases=_names(cases), rows=_names(rows), seeds=seeds)
@@ -109,6 +111,12 @@ def run_command(
     store = ResultStore(folder if out is None else out)
     study = study_of(whole, chosen, shlex.join(["sdc-taichi", *context.obj]), quick=quick)
     with job_session(store, study, jobs, quiet=quiet) as session:
+        if not quiet:
+            left = [job for job in planned_jobs(chosen) if not store.is_done(job)]
+            core_s = sum(map(core_s_of, left))
+            text = f"{len(left):,} jobs, about {duration(core_s)} of processor time, or "
+            text += f"{duration(core_s / session.workers)} in {session.workers} processes"
+            print(text, file=sys.stderr, flush=True)
         run_suite(chosen, store, session.run)
     if not quiet and session.is_whole:
         place = printable(store.folder)

@@ -148,6 +148,11 @@ class JobSession:
         return done
 
     @property
+    def workers(self) -> int:
+        """Number of jobs that run at the same time."""
+        return self._executor.workers
+
+    @property
     def is_whole(self) -> bool:
         """True unless an interruption left jobs out."""
         return all(each.is_whole for each in self.summaries)

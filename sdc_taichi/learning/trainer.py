@@ -54,12 +54,10 @@ from sdc_taichi.learning.training_folder import (
     write_settings,
     write_state,
 )
-from sdc_taichi.learning.training_settings import TrainingSettings
+from sdc_taichi.learning.training_settings import LEAST_DATA_CENTERS, TrainingSettings
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.solve import Progress as StageProgress
 
-LEAST_DATA_CENTERS = 256
-"""Minimum number of data centers in a training whose settings leave the number open."""
 LARGEST_LOSS = 1e6
 """Loss above which a training counts as diverged; values are normalised, so losses are about 1."""
 

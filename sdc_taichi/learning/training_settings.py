@@ -181,6 +181,8 @@ def _has_costs(rewards: Any) -> bool:
     return any(str(term).endswith("cost") for terms in scales for term in terms)
 
 
+LEAST_DATA_CENTERS = 256
+"""Minimum number of data centers in a training whose settings leave the number open."""
 MOST_STEPS = 10**12
 """Maximum number of steps of a training; even the fastest machine would take years for it."""
 Week = Annotated[int, Field(strict=True, ge=0, lt=WEEKS)]
