@@ -82,6 +82,7 @@ DC_INTS = {
     "first_steady_state": "first entry in steady_states of the table of pattern amounts (dense "
     "halls), or of the amounts of the modes per kelvin of each sampled rack (sparse halls)",
     "supply_rows": "number of supply temperatures in the table (dense halls)",
+    "heat_levels": "number of tables, one for each power of liquid_heat (dense halls)",
     "modes": "number of modes, and of sampled racks (sparse halls)",
     "first_sample": "first entry in sample_outlet_c (sparse halls)",
 }
@@ -173,6 +174,7 @@ DC_DOUBLES = {
     "fan_speed": "speed of fans that follow the hottest inlet / full speed",
     "table_low_c": "lowest supply temperature in the table of steady states, C",
     "table_rows_per_k": "rows of the table per K of supply temperature",
+    "liquid_heat": "heat of liquid-cooled racks into the air divided by that at full load",
     "feedback_gain": "change of the mixes by a sweep per previous common change",
     "crac_m3s_per_rack": "CRAC airflow divided by the number of racks, m3/s",
     "coupling": "exponent of the weights of the units in their shares, 0 for shares that are fixed",

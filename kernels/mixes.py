@@ -94,13 +94,18 @@ def look_up_steady_state(hall: ti.template(), n):
     row = ti.min(ti.cast(y, ti.i32), rows - 2)
     column = ti.min(ti.cast(x, ti.i32), columns - 2)
     row_weights, column_weights = catmull_rom(y - row), catmull_rom(x - column)
-    at = dc.first_steady_state + row * (columns + 2) + column
-    amounts = hall.zeros
-    for i in ti.static(range(4)):
-        for j in ti.static(range(4)):
-            weight = ti.cast(row_weights[i] * column_weights[j], hall.real)
-            amounts += hall.steady_states[at + j] * weight
-        at += columns + 2
+    first = dc.first_steady_state + row * (columns + 2) + column
+    amounts, level, scale = hall.zeros, 0, ti.cast(1.0, ti.f64)
+    while level < dc.heat_levels:
+        at = first
+        for i in ti.static(range(4)):
+            for j in ti.static(range(4)):
+                weight = ti.cast(scale * row_weights[i] * column_weights[j], hall.real)
+                amounts += hall.steady_states[at + j] * weight
+            at += columns + 2
+        first += (rows + 2) * (columns + 2)
+        scale *= dc.liquid_heat
+        level += hall.one
     dc.feedback_gain = ti.cast(amounts[MIX_PATTERNS], ti.f64)
     return amounts
 

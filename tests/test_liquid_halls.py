@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from ledgers import LEDGERS, OF_LIQUID, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
-from sdc_taichi import Actions, ConfigError, DataCenterConfig, SdcError, Simulator, load_config
+from sdc_taichi import (
+    Actions,
+    ConfigError,
+    DataCenterConfig,
+    SdcError,
+    Simulator,
+    load_config,
+    make_configs,
+)
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.config.loading import config_from_dict
 from sdc_taichi.errors import OddInputWarning
@@ -193,6 +201,29 @@ def test_a_rack_trips_without_coolant_and_restarts_once_it_flows_again() -> None
     assert [step.leak_l[0] for step in steps[47:51]] == [0.0, 30.0, 0.0, 0.0]
     assert steps[48].water_l[0] > 30.0
     assert not liquid[-1].any()
+
+
+def test_a_transient_hall_starts_from_the_steady_heat_of_its_liquid_racks() -> None:
+    with Simulator(liquid_hall(simulation={"thermal": "transient"})) as sim:
+        sim.reset()
+        first = sim.step()
+        assert first.liquid_air_w[0] > 1e4
+        assert abs(first.thermal_storage_w[0]) < 1.0
+        assert abs(first.liquid_stored_w[0]) < 1.0
+
+
+def test_steady_air_is_guessed_with_the_heat_that_coolant_leaves_to_it() -> None:
+    configs = make_configs(load_config("ai_hall_2026"), count=2, sites=["NY", "AZ"])
+    rng, sweeps = np.random.default_rng(0), []
+    with Simulator(configs) as sim:
+        sim.reset()
+        for _ in range(24):
+            setpoint_c, flow = rng.uniform(25.0, 45.0), rng.uniform(0.5, 1.1)
+            cooling = rng.uniform(-1.0, 1.0, sim.size)
+            sim.step(Actions(cooling=cooling, cdu_setpoint_c=setpoint_c, cdu_flow=flow))
+            sweeps.append(sim.sweeps)
+    assert np.mean(sweeps) < 1.5
+    assert np.max(sweeps) <= 2
 
 
 def test_rear_doors_take_more_heat_from_the_air_the_colder_their_coolant() -> None:

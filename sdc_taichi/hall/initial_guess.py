@@ -23,6 +23,9 @@ The solutions at all supply temperatures and loads are then written as sums of p
 mixes of the two racks were (9.29, 12.93) K times the load everywhere, the pattern (0.58, 0.81) with
 coefficient 15.9 K times the load would represent all of them. A hall has up to ``PATTERNS``
 patterns, the principal components of its table.
+
+The heat that liquid-cooled racks give to the air depends on their coolant as well. Tables of halls
+with such racks are computed at three heats, and their coefficients are parabolas of the heat.
 """
 
 from __future__ import annotations
@@ -59,6 +62,11 @@ them: these racks are so few that another of their sweeps costs little."""
 _BATCH_VALUES, _LEAST_BATCH = 2**13, 32
 """Number of values per batch, chosen so that a batch fits into the processor's cache, and smallest
 number of table entries per batch."""
+_IS_LIQUID = 6
+"""Row of ``_HallPart.columns`` that is 1 for servers of liquid-cooled racks."""
+_HEAT_STEP = 0.05
+"""Change of the heat of liquid-cooled racks between the levels of a table, divided by their heat at
+full load."""
 _SECANT_K = 1e-3
 """Smallest change of a mix, in K, from which a feedback gain is estimated."""
 _LAST_STEP_K = 2e-3
@@ -88,7 +96,9 @@ class SteadyStateTable:
     patterns: F64
     """Patterns of exhaust mix minus supply temperature over the racks, (k, R)."""
     pattern_shares: F32
-    """Coefficients of the patterns in each steady state, (n, len(TABLE_LOADS), k)."""
+    """Coefficients of the patterns in each steady state, (levels, n, len(TABLE_LOADS), k). In halls
+    with liquid-cooled racks level i is multiplied by the i-th power of the heat that these racks
+    give to the air, divided by that at full load. Other halls have level 0 alone."""
     feedback_gain: F32
     """Change of a rack's outlet divided by the change of its exhaust mix, in K/K, averaged over the
     racks, (n, len(TABLE_LOADS))."""
@@ -112,19 +122,46 @@ def initial_guess(
     """
     supply_c = table_supplies_c(config, recirculation.design)
     loads = TABLE_LOADS if modes is None else TABLE_LOADS[::_SAMPLED_LOADS_STEP]
-    part = _hall_part(servers, recirculation, modes)
-    states = _steady_states(config, servers, part, recirculation, supply_c, loads)
-    patterns, shares = _strongest_patterns(states.mix_k[:, :-1])
-    gain = states.feedback_gain.mean(axis=0)[:-1]
-    rows = np.concatenate([shares, gain[None]]).reshape(-1, len(loads))
+    part = _hall_part(config, servers, recirculation, modes)
+    liquid = part.columns[:3, part.columns[_IS_LIQUID] > 0.0]
+    usual, *others = (
+        _steady_states(config, servers, part, recirculation, supply_c, loads, more_heat)
+        for more_heat in ((0.0, -_HEAT_STEP, _HEAT_STEP) if liquid.size else (0.0,))
+    )
+    mixes_k = np.stack([states.mix_k[:, :-1] for states in (usual, *others)], axis=1)
+    patterns, shares = _strongest_patterns(mixes_k.reshape(len(mixes_k), -1))
+    levels = shares.reshape(len(patterns), *mixes_k.shape[1:])
+    if others:
+        count, full_w, idle_w = liquid
+        idle = np.sum(count * idle_w) / np.sum(count * full_w)
+        usual_heat = np.tile(idle + loads * (1.0 - idle), len(supply_c))
+        levels = _powers_of_heat(levels, usual_heat)
+    gain = usual.feedback_gain.mean(axis=0)[:-1]
+    rows = np.concatenate([levels.reshape(-1, gain.size), gain[None]]).reshape(-1, len(loads))
     between = np.stack([np.interp(TABLE_LOADS, loads, row) for row in rows])
     table = between.reshape(-1, len(supply_c), len(TABLE_LOADS)).astype(np.float32)
     return SteadyStateTable(
         supply_c=supply_c,
         patterns=patterns,
-        pattern_shares=np.moveaxis(table[:-1], 0, 2),
+        pattern_shares=np.moveaxis(table[:-1].reshape(*levels.shape[:2], *table.shape[1:]), 0, 3),
         feedback_gain=table[-1],
     )
+
+
+def _powers_of_heat(shares: F64, heat: F64) -> F64:
+    """Return the coefficients of the parabola of heat through three values of pattern shares.
+
+    Args:
+        shares: Pattern shares at the usual heat, ``_HEAT_STEP`` below and above it, (k, 3, m).
+        heat: Usual heat of liquid-cooled racks, divided by that at full load, (m,).
+
+    Returns:
+        Coefficients of the powers 0, 1 and 2 of the heat, (k, 3, m).
+    """
+    at, below, above = np.moveaxis(shares, 1, 0)
+    slope = (above - below) / (2.0 * _HEAT_STEP)
+    bend = (above + below - 2.0 * at) / (2.0 * _HEAT_STEP**2)
+    return np.stack([at - heat * (slope - heat * bend), slope - 2.0 * heat * bend, bend], axis=1)
 
 
 def table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
@@ -143,9 +180,9 @@ class _HallPart(NamedTuple):
     group_offsets: I32
     """Index of the first server group of each of R racks, and the number of groups, (R + 1,)."""
     columns: F64
-    """Properties of the G server groups, (7, G). The rows are count, full power, idle power, load
+    """Properties of the G server groups, (8, G). The rows are count, full power, idle power, load
     deviation, full airflow divided by that of the largest server, fan power at the reference ratio,
-    and exhaust share."""
+    1 for servers of liquid-cooled racks and 0 for others, and exhaust share."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     first_mix_k: F64
@@ -153,10 +190,16 @@ class _HallPart(NamedTuple):
 
 
 def _hall_part(
-    servers: RackServers, recirculation: Recirculation, modes: SteadyModes | None
+    config: DataCenterConfig,
+    servers: RackServers,
+    recirculation: Recirculation,
+    modes: SteadyModes | None,
 ) -> _HallPart:
     """Return all racks of a hall, or the racks that its modes sample."""
-    offsets, columns = servers.group_offsets, _columns(servers, recirculation)
+    is_liquid = np.zeros(config.hall.racks)
+    is_liquid[[*config.liquid_racks()]] = 1.0
+    offsets = servers.group_offsets
+    columns = _columns(servers, recirculation, servers.per_group(is_liquid))
     outlet_k = recirculation.design.outlet_rise_k
     if modes is None:
         weights = recirculation.mix_weights
@@ -170,8 +213,8 @@ def _hall_part(
     )
 
 
-def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
-    """Return the properties of the server groups for ``_HallPart.columns``, (7, G)."""
+def _columns(servers: RackServers, recirculation: Recirculation, is_liquid: F64) -> F64:
+    """Return the properties of the server groups for ``_HallPart.columns``, (8, G)."""
     full_m3s = recirculation.design.full_airflow_m3s
     return np.stack(
         [
@@ -181,6 +224,7 @@ def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
             servers.load_deviation,
             full_m3s / full_m3s.max(),
             servers.fan_reference_w,
+            is_liquid,
             recirculation.group_exhaust_share,
         ]
     )
@@ -193,8 +237,13 @@ def _steady_states(
     recirculation: Recirculation,
     supply_c: F64,
     loads: F64,
+    more_heat: float,
 ) -> _SteadyStates:
-    """Compute the steady states of the whole table and, as the last entry, of the design point."""
+    """Compute the steady states of the whole table and, as the last entry, of the design point.
+
+    ``more_heat`` is the heat of liquid-cooled racks above that of their load, divided by that at
+    full load.
+    """
     design = recirculation.design
     shape = len(part.first_mix_k), len(supply_c) * len(loads) + 1
     states = _SteadyStates(
@@ -204,6 +253,7 @@ def _steady_states(
         k_per_w=1.0 / (float(design.full_airflow_m3s.max()) * design.air_j_per_m3_k),
         supply_c=np.append(np.repeat(supply_c, len(loads)), design.supply_c),
         load=np.append(np.tile(loads, len(supply_c)), 1.0),
+        more_heat=more_heat,
         mix_k=np.broadcast_to(part.first_mix_k[:, None], shape),
         feedback_gain=np.full(shape, USUAL_GAIN),
     )
@@ -244,6 +294,8 @@ class _SteadyStates:
     """Supply temperature of each pair, in C, (m,)."""
     load: F64
     """Load of each pair, 0..1, (m,)."""
+    more_heat: float
+    """Heat of liquid-cooled racks above that of their load, divided by that at full load."""
     mix_k: F64
     """Exhaust mix of each rack minus supply temperature, in K, (R, m)."""
     feedback_gain: F64
@@ -257,7 +309,7 @@ class _SteadyStates:
         feedback gains, estimated as secants from the previous step.
 
         Args:
-            groups: Server groups by rack, see ``_by_rack``, (7, R, largest number of groups).
+            groups: Server groups by rack, see ``_by_rack``, (8, R, largest number of groups).
             passes: Largest number of steps.
         """
         previous: tuple[F64, F64] | None = None
@@ -287,7 +339,7 @@ class _SteadyStates:
     def _outlet_k(self, groups: F64) -> F64:
         """Return outlet minus supply temperatures for the present mixes, in K, (R, m)."""
         rows = (row[..., None] for row in groups)
-        count, full_w, idle_w, deviation, full_airflow, fan_w, exhaust_share = rows
+        count, full_w, idle_w, deviation, full_airflow, fan_w, is_liquid, exhaust_share = rows
         outlet_k = np.empty_like(self.mix_k)
         batch = max(_LEAST_BATCH, _BATCH_VALUES // count.size)
         for first in range(0, len(self.load), batch):
@@ -298,6 +350,9 @@ class _SteadyStates:
             inlet_c = self.supply_c[at] + inlet_k
             ratio = self.curves.airflow_ratio(inlet_c, load)
             power_w = self.curves.cpu_w(inlet_c, load, full_w, idle_w)
+            if is_liquid.any():
+                heat_w = idle_w + load * (full_w - idle_w) + self.more_heat * full_w
+                power_w = np.where(is_liquid, heat_w, power_w)
             power_w += self.curves.fan_w(ratio, fan_w)
             ratio = self.curves.moved_ratio(ratio, inlet_c, self.density_ratio)
             ratio = ratio * (count * full_airflow)
@@ -309,7 +364,7 @@ class _SteadyStates:
 
 
 def _by_rack(group_offsets: I32, columns: F64) -> F64:
-    """Arrange columns of groups, (7, G), by rack as (7, R, largest number of groups).
+    """Arrange columns of groups, (8, G), by rack as (8, R, largest number of groups).
 
     Padding groups have a count of 0.
     """

@@ -345,6 +345,7 @@ class Hall:
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
         """Buffers of ``groups`` and the same as kernel arguments; None before its first call."""
         self._dc["feedback_gain"][:] = USUAL_GAIN
+        self._dc["liquid_heat"][:] = 1.0
         tasks = np.diff(tables.arrays["task_offsets"])
         self._weighs_apart = len(tasks) > fleet.size and bool(np.any(fleet.plenum_coupling > 0))
         """True if a call of its own weighs the CRAC units of data centers that are split."""
@@ -368,6 +369,8 @@ class Hall:
         count, full_w = (rows[row_index(GROUP_INPUTS, name)] for name in ("count", "full_w"))
         of_rack_w = np.bincount(in_rack, count * full_w)
         self._heat_share = full_w[np.cumsum(counts) - counts] / of_rack_w
+        self._heat_dc = fleet.rack_dc[racks].astype(np.intp)
+        self._full_heat_w = np.maximum(np.bincount(self._heat_dc, of_rack_w, fleet.size), 1e-30)
         self._heat_places = self._places.of_racks[racks]
         block, of_blocks = self._heat_places // LANES, self._tables.rows("block_ints")
         in_rack, entries = items_of_ranges(
@@ -389,6 +392,8 @@ class Hall:
             rack_w: Heat of each of these racks, in W.
         """
         self._rack["heat_w"][self._heat_places] = self._heat_share * rack_w
+        of_dc_w = np.bincount(self._heat_dc, rack_w, self._fleet.size)
+        self._dc["liquid_heat"][:] = of_dc_w / self._full_heat_w
 
     @property
     def sweeps(self) -> I32:

@@ -511,7 +511,7 @@ def build_steady_states(
         modes: Modes of sparse halls by their index in ``HallAir.steady_states``; a hall that is
             missing starts from its supply temperature.
     """
-    names = ("first_pattern", "first_steady_state", "supply_rows", "modes")
+    names = ("first_pattern", "first_steady_state", "supply_rows", "heat_levels", "modes")
     air = fleet.air
     if air is None:
         return vectors(dtype, 1), dict.fromkeys(names, np.zeros(1))
@@ -522,9 +522,9 @@ def build_steady_states(
     for entry, (table, blocks) in enumerate(
         zip(air.steady_states, places.blocks[first_dcs], strict=True)
     ):
-        count = supply_rows = 0
+        count = supply_rows = heat_levels = 0
         if isinstance(table, SteadyStateTable):
-            supply_rows = len(table.supply_c)
+            heat_levels, supply_rows = table.pattern_shares.shape[:2]
             patterns = np.zeros((MIX_PATTERNS, table.patterns.shape[1]))
             patterns[: len(table.patterns)] = table.patterns
             parts += [_by_block(patterns, int(blocks)), _amounts_with_margin(table)]
@@ -541,7 +541,7 @@ def build_steady_states(
         else:
             parts += [np.zeros((0, LANES))] * 2
         first_amount = total + len(parts[-2])
-        index_rows.append((total, first_amount, supply_rows, count))
+        index_rows.append((total, first_amount, supply_rows, heat_levels, count))
         total = first_amount + len(parts[-1])
     offsets_from_counts([total], "vectors of steady states")
     out = vectors(dtype, total)
@@ -561,10 +561,10 @@ def _amounts_with_margin(table: SteadyStateTable) -> Array:
 
     Cubic interpolation reads one row and column beyond the table on each side.
     """
-    amounts = np.zeros((*table.feedback_gain.shape, LANES))
-    amounts[..., : table.pattern_shares.shape[2]] = table.pattern_shares
-    amounts[..., MIX_PATTERNS] = table.feedback_gain
-    beyond = ((1, 1), (1, 1), (0, 0))
+    amounts = np.zeros((*table.pattern_shares.shape[:3], LANES))
+    amounts[..., : table.pattern_shares.shape[3]] = table.pattern_shares
+    amounts[0, ..., MIX_PATTERNS] = table.feedback_gain
+    beyond = ((0, 0), (1, 1), (1, 1), (0, 0))
     return np.pad(amounts, beyond, mode="reflect", reflect_type="odd").reshape(-1, LANES)
 
 

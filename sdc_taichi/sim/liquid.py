@@ -480,6 +480,11 @@ class Liquid:
         return np.where(np.isnan(self._trim_cop), by_model_w, by_cop_w)
 
     @property
+    def air_w(self) -> F64:
+        """Heat of each rack into the air in the last step, as in ``LiquidResult``, in W, (L,)."""
+        return np.asarray(self._arrays["rack_out"][[*spec.RACK_OUT].index("air_w")])
+
+    @property
     def junction_c(self) -> F64:
         """Junction temperature of each rack at the end of the last step, in C, (L,)."""
         return np.asarray(self._arrays["rack_state"][0])

@@ -126,7 +126,7 @@ class LiquidHalls:
         warn_of([(name, [text]) for name, text in odd if text is not None])
 
     def initial(self, surroundings_c: tuple[F64, F64], load: F64) -> dict[str, F64]:
-        """Return the fields of ``State`` before the first step.
+        """Return the fields of ``State`` before the first step; give transient halls the heat.
 
         Args:
             surroundings_c: Outdoor dry bulb and wet bulb, in C, (B,) each.
@@ -142,6 +142,8 @@ class LiquidHalls:
                 dew_point_c=self._dew_point.at(outdoor_c, wet_bulb_c),
             )
         )
+        if self._transient:
+            self._set_heat(self._model.air_w)
         return self._kept(state)
 
     def step(
@@ -183,9 +185,7 @@ class LiquidHalls:
                 **failures,
             ),
         )
-        # Cold lines can take up more than racks give while they have no power.
-        result.air_w = np.maximum(result.air_w, 0.0)
-        self._hall.set_heat(result.air_w)
+        result.air_w = self._set_heat(result.air_w)
         return self._as_step(
             after, result, on, share, self._racks_without_coolant(surroundings, failures)
         )
@@ -224,6 +224,13 @@ class LiquidHalls:
     def close(self) -> None:
         """Release the kernel arrays."""
         self._model.close()
+
+    def _set_heat(self, air_w: F64) -> F64:
+        """Set the heat that liquid-cooled racks give to the air of the halls; return it, (L,)."""
+        # Cold lines can take up more than racks give while they have no power.
+        air_w = np.maximum(air_w, 0.0)
+        self._hall.set_heat(air_w)
+        return air_w
 
     def _as_step(
         self,
