@@ -342,7 +342,7 @@ def test_each_agent_may_have_its_own(sim: Simulator) -> None:
     [
         ("g37", r"controller 'g37': unknown; valid: idle, .*did you mean 'g36'\?"),
         ("lookahead", "did you mean 'lookahead-3h'"),
-        ("load=g36", "'g36': does not act on load; valid for load: idle, random, greedy-ci"),
+        ("load=g36", "'g36': does not act on load; valid for load: idle, random, drain, greedy-ci"),
         ("battery=constant:20", "'constant:20': does not act on battery"),
         ("cool=g36", "'cool=g36': valid is agent=name .*did you mean 'cooling'"),
         ("geo=mpc-24h", "'mpc-24h': does not act on geo; valid for geo: idle, geo-all-to-cleanest"),

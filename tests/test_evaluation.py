@@ -168,7 +168,7 @@ def test_tabled_ends_are_near_the_bounds() -> None:
     texas = make_configs(load_config("corrected"), sites=["tx"])
     with prepare(texas, (27,), days=2, exact_ends=True, cache=False) as weeks:
         best = weeks.optimum
-        assert best is not None
+        assert isinstance(best, Optimum)
         table = with_tabled_ends(best, weeks.sim)
         kwh = 0.98 * weeks.sim.sizing.battery_kwh
         tasks = 0.85 * queue_limit_tasks(weeks.sim.fleet)

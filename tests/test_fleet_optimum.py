@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sdc_taichi import Simulator, load_config, with_values
+from sdc_taichi import ConfigError, Simulator, load_config, make_controller, with_values
+from sdc_taichi.benchmark.cases import check_suite
+from sdc_taichi.benchmark.suite import make_suite
+from sdc_taichi.benchmark.suite_jobs import packed, run_row, solve_reference
+from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs
 from sdc_taichi.cli.app import app
-from sdc_taichi.optimum.fleet import Hub, fleet_plan, solve_fleet
+from sdc_taichi.learning.evaluation import Contender, evaluate, prepare, validate
+from sdc_taichi.optimum import fleet as fleet_optimum
+from sdc_taichi.optimum.fleet import FleetOptimum, Hub, emissions_g, fleet_plan, solve_fleet
 from sdc_taichi.optimum.problem import FlexibleWork
 from sdc_taichi.optimum.programme import InfeasibleError
 from sdc_taichi.optimum.stage_cost import LoadCurves
+from sdc_taichi.run.loop import simulate
 from sdc_taichi.types import F64
 
 
@@ -124,9 +132,7 @@ def test_a_plan_is_reached_in_the_simulator() -> None:
 
 
 def test_the_command_prints_bound_achieved_and_rules(tmp_path: Path) -> None:
-    file = tmp_path / "two.yaml"
-    file.write_text("extends: tiny\nfleet: {sites: [AZ, WA]}\n")
-    case = ["optimum", str(file), "--days", "1", "--quiet"]
+    case = ["optimum", pair_of_sites(tmp_path), "--days", "1", "--quiet"]
     done = CliRunner().invoke(app, [*case, "--json", "--controller", "geo-central"])
     assert done.exit_code == 0, done.output
     content = json.loads(done.stdout)
@@ -143,3 +149,67 @@ def test_the_command_prints_bound_achieved_and_rules(tmp_path: Path) -> None:
         wrong = CliRunner().invoke(app, [*case[:2], *option, *case[2:]])
         assert wrong.exit_code == 2, option
         assert message in wrong.stderr
+
+
+def pair_of_sites(tmp_path: Path) -> str:
+    file = tmp_path / "two.yaml"
+    file.write_text("extends: tiny\nfleet: {sites: [AZ, WA]}\n")
+    return str(file)
+
+
+def test_a_fleet_is_evaluated_as_one_data_center(tmp_path: Path) -> None:
+    config = load_config(pair_of_sites(tmp_path))
+    with prepare([config], (3, 27), days=2, cache=tmp_path) as weeks:
+        central = make_controller("geo=geo-central,load=drain", weeks.sim.fleet)
+        rows = evaluate(weeks, [Contender("central", central)]).rows.set_index("controller")
+        validation = validate(central, weeks)
+        done = simulate(weeks.sim, central, weeks.steps, weeks.seed)
+        grams = emissions_g(weeks.sim, done.sums["carbon_g"], done.sums["transfer_g"], weeks.steps)
+        optimum = weeks.optimum
+    assert isinstance(optimum, FleetOptimum)
+    of_rule, idle = rows.loc["central"], rows.loc["idle"]
+    assert of_rule["figure"].to_numpy() == pytest.approx(grams / 1e3)
+    assert idle["figure"].to_numpy() == pytest.approx(optimum.idle)
+    assert idle["share"].to_numpy() == pytest.approx(0.0, abs=1e-12)
+    assert ((of_rule["share"] > 0.0) & (of_rule["share"] < 1.0)).all()
+    assert (of_rule["broken"] == "").all()
+    kwh = done.sums["grid_kwh"].reshape(2, 2)
+    assert of_rule["grid_kwh"].to_numpy() == pytest.approx(kwh.sum(axis=1))
+    highest = (optimum.idle - of_rule["figure"]).sum() / (optimum.idle - optimum.achieved).sum()
+    assert validation.share == pytest.approx(highest)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fleet_optimum, "fleet_plan", lambda *_, **__: pytest.fail("solved anew"))
+        with prepare([config], (27,), days=2, cache=tmp_path) as again:
+            assert again.optimum is not None
+            assert again.optimum.bound == optimum.bound[1]
+    with pytest.raises(ConfigError, match="cost: valid for fleets that share work is carbon"):
+        prepare([config], (3,), days=2, objective="cost")
+
+
+def test_a_suite_of_fleets_has_a_row_for_each_week(tmp_path: Path) -> None:
+    suite = make_suite(
+        {
+            "name": "pair",
+            "title": "Two sites",
+            "cases": {"pair": {"config": pair_of_sites(tmp_path), "weeks": [3], "days": 2}},
+            "rows": {
+                "geo-central": {"controller": "geo=geo-central,load=drain"},
+                "optimum": {"optimum": "achieved"},
+                "bound": {"optimum": "bound"},
+            },
+        }
+    )
+    check_suite(suite)
+    (reference,) = reference_jobs(suite)
+    solved = solve_reference(reference.values, {})
+    assert solved.metrics["site"] == "tiny"
+    inputs = {reference.name: packed(solved.files, solved.metrics)}
+    figures = {}
+    for job in row_jobs(suite, [reference]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # such as one that the optimum is solved anew
+            rows = run_row(job.values, inputs).rows
+        assert rows is not None
+        assert rows[["site", "week"]].to_numpy().tolist() == [["tiny", 3]]
+        figures[job.partition["row"]] = rows["valued_figure"].item()
+    assert figures["bound"] < figures["optimum"] < figures["geo-central"]

@@ -49,6 +49,7 @@ from sdc_taichi.learning.evaluation import (
 )
 from sdc_taichi.learning.training_settings import merged
 from sdc_taichi.optimum.cache import OptimumCacheWarning
+from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
             "idle_figure": weeks.idle.tolist(),
             "achieved_figure": weeks.optimum.achieved.tolist(),
             "bound_figure": weeks.optimum.bound.tolist(),
-            "bound_kinds": weeks.optimum.bound_kinds,
+            "bound_kinds": _bound_kinds(weeks),
         }
     return JobResult(None, metrics, files)
 
@@ -296,7 +297,7 @@ def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
             return changes[spec]
 
         if task.row.best_of == "rules":
-            best = best_rules(task.objective, change_pct)
+            best = best_rules(task.objective, change_pct, weeks.sim.fleet)
         else:
             best = min(task.row.best_of, key=change_pct)
     return _Made(best, {"chosen": best, "validation_change_pct": changes}, {})
@@ -424,6 +425,8 @@ def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
         assert best is not None
         if task.row.optimum == "bound":
             return _rows_of_figures(weeks, {ALL: best.bound})
+        if not isinstance(best, Optimum):
+            return _rows_of_figures(weeks, {ALL: best.achieved})
         achieved = evaluate(weeks, [Contender(_ROW, AchievedPath(best))], beside=False).rows
         others = _rows_of_figures(weeks, {**best.alone, **best.uncoordinated})
         return pd.concat([achieved, others], ignore_index=True)
@@ -443,13 +446,13 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
     import numpy as np
     import pandas as pd
 
-    best, nan = weeks.optimum, np.full(weeks.sim.size, np.nan)
+    best, nan = weeks.optimum, np.full(len(weeks.sites), np.nan)
     achieved = nan if best is None else best.achieved
     frames = []
     for moves, figure in figures.items():
         columns = {
             "controller": "",
-            "training": pd.array([pd.NA] * weeks.sim.size, dtype="Int64"),
+            "training": pd.array([pd.NA] * len(weeks.sites), dtype="Int64"),
             "moves": moves,
             "site": weeks.sites,
             "year": weeks.years,
@@ -477,5 +480,13 @@ def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]
         "scored_from": weeks.scored_from,
         "fingerprint": weeks.sim.fingerprint(),
         "has_optimum": weeks.optimum is not None,
-        "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),
+        "bound_kinds": sorted(set(_bound_kinds(weeks))),
     }
+
+
+def _bound_kinds(weeks: DataCenterWeeks) -> list[str]:
+    """Return the kind of the bound of each week; empty without an optimum."""
+    best = weeks.optimum
+    if isinstance(best, Optimum):
+        return list(best.bound_kinds)
+    return [] if best is None else ["bound"] * len(weeks.sites)

@@ -163,7 +163,7 @@ def simulate_command(
         str,
         controllers_option(
             "idle, rules, random, g36, coldest, warmest, constant:C, lookahead-3h, "
-            "lookahead-24h, rank-24h, greedy-ci, follow, local-pi, common-pi, "
+            "lookahead-24h, rank-24h, drain, greedy-ci, follow, local-pi, common-pi, "
             "g36-trim-respond, one-speed, geo-central, geo-all-to-cleanest, geo-three-cleanest, "
             "geo-all-cleaner, geo-mpc, liquid-wet-bulb, liquid-reset, liquid-greedy, mpc-24h, "
             "policy:FOLDER; or module:name of your own; or per agent, such as "

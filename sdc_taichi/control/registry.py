@@ -24,6 +24,7 @@ from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
     COMMANDS_OF_PART,
     Controller,
+    Drain,
     FixedSetpoint,
     GreedyCarbon,
     Idle,
@@ -75,6 +76,7 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "warmest": _NamedController(lambda: FixedSetpoint("high"), ("cooling",)),
     "lookahead-3h": _NamedController(lambda: Rank(3.0, commands=("battery",)), ("battery",)),
     "lookahead-24h": _NamedController(lambda: Rank(24.0, commands=("battery",)), ("battery",)),
+    "drain": _NamedController(Drain, ("load",)),
     "greedy-ci": _NamedController(GreedyCarbon, ("load", "battery")),
     "geo-all-to-cleanest": _NamedController(lambda: Alone(all_to_cleanest), ("geo",)),
     "geo-three-cleanest": _NamedController(lambda: Alone(three_cleanest), ("geo",)),

@@ -208,6 +208,17 @@ class Rank(WithoutMemory):
         return Actions(**{name: given[name] for name in self.commands})
 
 
+class Drain(WithoutMemory):
+    """Controller of work that runs waiting work as soon as there is capacity for it."""
+
+    commands = ("load",)
+    """Fields of ``Actions`` that it gives."""
+
+    def act(self, view: View) -> Actions:
+        """Return commands that drain all queues."""
+        return Actions(load=np.ones(view.size))
+
+
 class GreedyCarbon(WithoutMemory):
     """Controller of work and battery that compares the carbon intensity with its forecast mean.
 

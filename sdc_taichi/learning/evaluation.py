@@ -39,11 +39,20 @@ from sdc_taichi.learning.statistics import change_pct, share_pct
 from sdc_taichi.learning.training_folder import SETTINGS_FILE, settings_of
 from sdc_taichi.learning.training_settings import TrainingSettings
 from sdc_taichi.optimum import StoppedError
-from sdc_taichi.optimum.objective import Objective, Score
+from sdc_taichi.optimum.cache import cache_in
+from sdc_taichi.optimum.fleet import FleetOptimum, FleetScore, solve_fleet
+from sdc_taichi.optimum.objective import CARBON, Objective, Score
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.optimum.result import Optimum, with_tabled_ends
 from sdc_taichi.optimum.solve import Progress, solve
-from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, achievement, begin_score
+from sdc_taichi.run.achievable import (
+    OPTIMUM,
+    AchievedPath,
+    Achievement,
+    achievement,
+    begin_score,
+    fleet_achievement,
+)
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import add_step, empty_totals, metrics_per_dc
 from sdc_taichi.sim.bills import no_demand
@@ -69,6 +78,9 @@ METRICS = (
 )
 """Metrics of ``run.metrics`` that each row of an evaluation reports, over the scored steps."""
 
+_HIGHEST, _MEANS = ("peak_kw", "hottest_inlet_c"), ("over_27_degree_h", "queue_mean_tasks")
+"""Metrics that are maxima and means over the sites of a fleet; all others are sums."""
+
 
 @dataclass(frozen=True, slots=True)
 class DataCenterWeeks:
@@ -80,9 +92,9 @@ class DataCenterWeeks:
     sim: Simulator
     """Simulator of B data-center weeks."""
     sites: tuple[str, ...]
-    """Name of each data center without its week, B."""
+    """Name of each data center, or fleet that shares work, without its week."""
     years: tuple[int, ...]
-    """Seed of the synthetic year of each data center (``site.seed``), B."""
+    """Seed of the synthetic year of each data center or fleet (``site.seed``)."""
     weeks: tuple[int, ...]
     """Week of the year of each data center, 0..51, B."""
     objective: Objective
@@ -97,7 +109,7 @@ class DataCenterWeeks:
     """Sizes of the errors of the forecasts that controllers get."""
     idle: F64
     """Objective of idle commands over the scored steps, in the unit of the objective, (B,)."""
-    optimum: Optimum | None
+    optimum: Optimum | FleetOptimum | None
     """Optimum of the same weeks; None if it was not computed."""
 
     def __enter__(self) -> Self:
@@ -228,8 +240,14 @@ def prepare(
     try:
         per_day = 24 * sim.fleet.steps_per_hour
         steps, scored_from = days * per_day, UNSCORED_DAYS * per_day
-        best = None
-        if optimum:
+        best: Optimum | FleetOptimum | None = None
+        if sim.fleet.shared_work is not None:
+            scored_from = 0
+            if aim != CARBON:
+                raise ConfigError(f"objective {aim}: valid for fleets that share work is carbon")
+            if optimum:
+                best = solve_fleet(sim, steps=steps, check=_check(stop), cache=cache_in(cache))
+        elif optimum:
             best = solve(
                 sim.fleet,
                 steps=steps,
@@ -281,7 +299,7 @@ def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
     figure, best = score.figure[None], weeks.optimum
     if best is None:
         return Validation(float(change_pct(figure, weeks.idle[None])), float("nan"), 0)
-    reached = achievement(best, "", score)
+    reached = _achievement(best, score)
     figure = reached.valued_figure[None]
     return Validation(
         float(change_pct(figure, weeks.idle[None])),
@@ -366,8 +384,8 @@ def evaluate(
     return Evaluation(
         rows=rows,
         objective=weeks.objective,
-        alone={} if best is None else dict(best.alone),
-        uncoordinated={} if best is None else dict(best.uncoordinated),
+        alone=dict(best.alone) if isinstance(best, Optimum) else {},
+        uncoordinated=dict(best.uncoordinated) if isinstance(best, Optimum) else {},
         strata=weeks.strata,
         missing=tuple(dict.fromkeys(missing)),
     )
@@ -409,7 +427,7 @@ def _runs(
     check_contenders(listed)
     if beside:
         listed = [Contender(IDLE, Idle()), *(each for each in listed if each.name != IDLE)]
-    if beside and weeks.optimum is not None:
+    if beside and isinstance(weeks.optimum, Optimum):
         listed.append(Contender(OPTIMUM, AchievedPath(weeks.optimum)))
     runs = []
     for each in listed:
@@ -442,14 +460,15 @@ def _rows(
     score, is_whole = _run(weeks, controller, add, stop)
     if not is_whole:
         return None
-    best, nan = weeks.optimum, np.full(weeks.sim.size, np.nan)
+    best, nan = weeks.optimum, np.full(len(weeks.sites), np.nan)
     valued, share, achieved = nan, nan, nan
-    broken: Sequence[str | None] = [None] * weeks.sim.size
+    broken: Sequence[str | None] = [None] * len(weeks.sites)
     if best is not None:
-        reached = achievement(best, "", score)
+        reached = _achievement(best, score)
         valued, share, achieved = reached.valued_figure, reached.share, best.achieved
         broken = ["; ".join(texts) for texts in reached.broken]
-    metrics = metrics_per_dc(totals, fleet)
+    per_dc = metrics_per_dc(totals, fleet)
+    metrics = {x: np.array([float(dc[x] or 0.0) for dc in per_dc]) for x in METRICS}
     return pd.DataFrame(
         {
             "site": weeks.sites,
@@ -461,7 +480,7 @@ def _rows(
             "achieved_figure": achieved,
             "share": share,
             "broken": broken,
-            **{name: [float(dc[name] or 0.0) for dc in metrics] for name in METRICS},
+            **{name: _of_fleets(name, values, fleet) for name, values in metrics.items()},
         }
     )
 
@@ -473,10 +492,15 @@ def _run(
     stop: Callable[[], bool] | None = None,
 ) -> tuple[Score, bool]:
     """Return the score of a run through the weeks, and True if the run was not stopped early."""
-    if weeks.optimum is None:
+    score: Score
+    if weeks.sim.fleet.shared_work is not None:
+        weeks.sim.reset(weeks.seed)
+        score = FleetScore(weeks.sim)
+    elif weeks.optimum is None:
         weeks.sim.reset(weeks.seed)
         score = Score(weeks.objective, weeks.sim, weeks.scored_from)
     else:
+        assert isinstance(weeks.optimum, Optimum)
         score = begin_score(weeks.optimum, weeks.sim, weeks.seed)
 
     def add(result: StepResult) -> None:
@@ -494,6 +518,33 @@ def _run(
         stop=stop,
     )
     return score, done.steps == weeks.steps
+
+
+def _check(stop: Callable[[], bool] | None) -> Callable[[], None]:
+    """Return a function that raises ``StoppedError`` if ``stop`` returns true."""
+
+    def check() -> None:
+        if stop is not None and stop():
+            raise StoppedError("nothing is kept")
+
+    return check
+
+
+def _achievement(best: Optimum | FleetOptimum, score: Score) -> Achievement:
+    """Compare the score of a run with the optimum of the same weeks."""
+    if isinstance(best, FleetOptimum):
+        assert isinstance(score, FleetScore)
+        return fleet_achievement(best, score)
+    return achievement(best, "", score)
+
+
+def _of_fleets(name: str, values: F64, fleet: Fleet) -> F64:
+    """Return a metric of B data centers for each fleet that shares work, or as it is without."""
+    if fleet.shared_work is None:
+        return values
+    of_sites = values.reshape(-1, fleet.sites_per_fleet)
+    together = np.max if name in _HIGHEST else np.mean if name in _MEANS else np.sum
+    return np.asarray(together(of_sites, axis=1))
 
 
 def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:

@@ -30,6 +30,7 @@ from sdc_taichi.learning.statistics import (
     probability_of_improvement,
     share_pct,
 )
+from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import OPTIMUM
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import list_folder
@@ -371,6 +372,8 @@ def remarks(weeks: DataCenterWeeks) -> list[str]:
     """
     if weeks.optimum is None:
         return ["Without an optimum ends have no value: an empty battery or work put off saves."]
+    if not isinstance(weeks.optimum, Optimum):
+        return []
     names, kinds = weeks.optimum.names, weeks.optimum.bound_kinds
     return [
         f"{name}: bound {kind}; ends that differ have no value there"

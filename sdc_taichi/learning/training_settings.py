@@ -159,8 +159,9 @@ def training_environment(options: Mapping[str, Any]) -> dict[str, Any]:
         defaults["collaboration"] = 1.0
     if agents and options.get("observations", "default") == "default":
         defaults["ci_leads_h"] = CI_LEADS_H
-        if not commands:
-            defaults["features"] = {agent: _features(agent, options) for agent in agents}
+        # The features of an agent with other commands are those of the environment.
+        if features := {x: _features(x, options) for x in agents if x not in commands}:
+            defaults["features"] = features
     return defaults
 
 
@@ -427,8 +428,6 @@ class TrainingSettings(Section):
             ConfigError: a file, value or site is not valid.
         """
         configs = self.data_centers_of_sites()
-        if configs[0].fleet is not None:
-            configs = [self._config()]
         if self.weeks is None:
             return configs
         weeks = TRAINING if self.weeks == "training" else self.weeks
@@ -444,13 +443,16 @@ class TrainingSettings(Section):
     def data_centers_of_sites(self) -> list[DataCenterConfig]:
         """Return one data center for each site; without ``sites``, that of the configuration.
 
+        A configuration of a fleet stands for the data centers of its sites.
+
         Raises:
             ConfigError: a file, value or site is not valid.
         """
         config, tariff = self._config(), self.environment.tariff
         if tariff is not None:
             config = config.model_copy(update={"tariff": tariff})
-        return make_configs(config, sites=self.sites)
+        is_fleet = config.fleet is not None and not self.sites
+        return [config] if is_fleet else make_configs(config, sites=self.sites)
 
     def validation_weeks(self) -> int:
         """Return the number of validation weeks of all sites together."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -171,6 +172,27 @@ class Cache:
         values = {"fingerprint": key, "ends": ends, "figures": np.array([*figures.values()])}
         self._write(self._path(f"{key}-ends"), values)
 
+    def find_figures(self, key: str, names: Sequence[str]) -> dict[str, float] | None:
+        """Return the figures of a key by name, or None if there are none.
+
+        Args:
+            key: Key from ``key_of``.
+            names: Names of the figures, which may be nan.
+        """
+
+        def figures(arrays: Mapping[str, Any]) -> dict[str, float]:
+            if str(arrays["fingerprint"]) != key:
+                raise ValueError("is of other configs, inputs or options")
+            limits = -_MOST_FIGURE, _MOST_FIGURE
+            return {x: _numbers(arrays, x, (), *limits, or_nan=True).item() for x in names}
+
+        return self._read(self._path(key), figures, "the optimum is")
+
+    def keep_figures(self, key: str, figures: Mapping[str, float]) -> None:
+        """Write figures atomically, by name."""
+        values = {name: np.float64(figure) for name, figure in figures.items()}
+        self._write(self._path(key), {**values, "fingerprint": key})
+
     def _read(self, path: Path, parse: Callable[[Mapping[str, Any]], _X], what: str) -> _X | None:
         """Return the content of a file, or None if it is missing or, with a warning, damaged."""
         if not path.is_file():
@@ -194,6 +216,13 @@ class Cache:
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.npz"
+
+
+def cache_in(folder: bool | str | os.PathLike[str]) -> Cache | None:
+    """Return the cache in a folder, True for the user's cache; None if ``folder`` is False."""
+    if folder is False:
+        return None
+    return Cache(None if folder is True else Path(folder))
 
 
 def usual_folder() -> Path:

@@ -16,13 +16,14 @@ hours.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, whole_number
-from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.cache import Cache, key_of
+from sdc_taichi.optimum.objective import CARBON, Objective, Score
 from sdc_taichi.optimum.paths import cheapest_setpoints_c
 from sdc_taichi.optimum.problem import (
     RAMP_K,
@@ -36,16 +37,17 @@ from sdc_taichi.optimum.stage_cost import LoadCurves, load_curves, stage_cost
 from sdc_taichi.optimum.tables import facility_kwh, facility_tables
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.shared_work import SharedWork
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.transfer import task_kwh, transfer_kwh_per_task
 from sdc_taichi.sim.workload import due_entries, due_steps, due_work, queue_length
-from sdc_taichi.types import F64, I64, Actions, State
+from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 UTILISATIONS = 21
 """Number of utilisations of the tables; with 41, bounds are 0.02 % tighter."""
@@ -284,10 +286,69 @@ class FleetOptimum:
     table_error: F64
     """Relative error of the tables' energy in the simulated plan, by which the bounds are lowered,
     (F,)."""
+    idle_dropped_tasks: F64
+    """Work that is dropped because queues are full under idle commands, in tasks, (F,)."""
+    overdue_tasks: F64
+    """Largest overdue work of the sites in a step of the simulated plan, in tasks, (F,)."""
+
+    @property
+    def idle(self) -> F64:
+        """Emissions under idle commands, in kg CO2e, (F,)."""
+        return self.idle_g / 1e3
+
+    @property
+    def bound(self) -> F64:
+        """Lower bound of the emissions, in kg CO2e, (F,)."""
+        return self.bound_g / 1e3
+
+    @property
+    def achieved(self) -> F64:
+        """Emissions of the simulated plan, in kg CO2e, (F,)."""
+        return self.achieved_g / 1e3
 
     def saved_pct(self, emitted_g: F64) -> float:
         """Return the savings of all fleets together against idle commands, in %."""
         return float(100.0 * (1.0 - emitted_g.sum() / self.idle_g.sum()))
+
+
+class FleetScore(Score):
+    """Accumulates the emissions of F fleets, and sums and extremes of their B data centers.
+
+    Args:
+        sim: the simulator, directly after a reset.
+    """
+
+    def __init__(self, sim: Simulator) -> None:
+        super().__init__(CARBON, sim)
+        self._sim, self._transfer_g = sim, np.zeros(sim.size)
+
+    def add(self, result: StepResult) -> None:
+        """Add the result of the next step; steps must be added in order."""
+        super().add(result)
+        self._transfer_g += result.transfer_g
+
+    @property
+    def figure(self) -> F64:
+        """Emissions of each fleet, with transfers and the work that is left, in kg CO2e, (F,)."""
+        return self.emitted_g / 1e3
+
+    @property
+    def emitted_g(self) -> F64:
+        """Emissions of each fleet, with transfers and the work that is left, in g CO2e, (F,)."""
+        return emissions_g(self._sim, self._sums["carbon_g"], self._transfer_g, self._steps)
+
+    @property
+    def dropped_of_fleets(self) -> F64:
+        """Work dropped because queues were full, in tasks, (F,)."""
+        return np.asarray(self._of_sites(self.dropped_tasks).sum(axis=1))
+
+    @property
+    def overdue_of_fleets(self) -> F64:
+        """Maximum overdue work of a site in a step, in tasks, (F,)."""
+        return np.asarray(self._of_sites(self.most_overdue_tasks).max(axis=1))
+
+    def _of_sites(self, values: F64) -> F64:
+        return values.reshape(-1, self._sim.fleet.sites_per_fleet)
 
 
 def emissions_g(sim: Simulator, carbon_g: F64, transfer_g: F64, steps: int) -> F64:
@@ -315,6 +376,7 @@ def solve_fleet(
     *,
     steps: int,
     check: Callable[[], None] = lambda: None,
+    cache: Cache | None = None,
 ) -> FleetOptimum:
     """Compute the least carbon that fleets can emit if all inputs are known.
 
@@ -322,6 +384,7 @@ def solve_fleet(
         sim: Simulator of F fleets; it is reset.
         steps: Number of steps, T, from the start of its drivers.
         check: Called before every programme; an error that it raises ends the work.
+        cache: Cache with an entry for each fleet; None neither reads nor writes one.
 
     Raises:
         ConfigError: The data centers share no work, or no plan satisfies the limits.
@@ -338,6 +401,12 @@ def solve_fleet(
         raise ConfigError(f"optimum of a fleet: no bound, since {reasons[0]}")
     sim.reset()
     drivers, sizing, sites = sim.drivers, sim.sizing, fleet.sites_per_fleet
+    keys = [] if cache is None else _keys(sim, steps)
+    if cache is not None:
+        known = (cache.find_figures(key, _FIGURES) for key in keys)
+        entries = [entry for entry in known if entry is not None]
+        if len(entries) == len(keys):
+            return FleetOptimum(steps, **{x: np.array([e[x] for e in entries]) for x in _FIGURES})
     problems = _problems(fleet, drivers, sizing, steps, sim.precision)
     stages = [stage_cost(problem) for problem in problems]
     curves = [load_curves(problem, stage) for problem, stage in zip(problems, stages, strict=True)]
@@ -392,19 +461,45 @@ def solve_fleet(
         np.zeros((steps, fleet.size)),
         np.stack([_cheapest_c(p, p.work.idle_tasks) for p in problems], axis=1),
     )
-    idle_g, _ = _run(sim, steps, lambda _: Actions(), problems)
-    cooled_g, _ = _run(sim, steps, cooled.actions, problems)
-    achieved_g, error = _run(sim, steps, follower.actions, problems)
+    # Scores read the state at the end of their run, so their emissions are taken before the next.
+    score, _ = _run(sim, steps, lambda _: Actions(), problems)
+    idle_g, idle_dropped_tasks = score.emitted_g, score.dropped_of_fleets
+    cooled_g = _run(sim, steps, cooled.actions, problems)[0].emitted_g
+    score, error = _run(sim, steps, follower.actions, problems)
     lowered = 1.0 - error - 1e-6
-    return FleetOptimum(
+    optimum = FleetOptimum(
         steps=steps,
         idle_g=idle_g,
         cooled_g=cooled_g,
         stay_g=1e3 * np.array(stay) * lowered,
         bound_g=1e3 * np.array(bound) * lowered,
-        achieved_g=achieved_g,
+        achieved_g=score.emitted_g,
         table_error=error,
+        idle_dropped_tasks=idle_dropped_tasks,
+        overdue_tasks=score.overdue_of_fleets,
     )
+    for at, key in enumerate(keys):
+        assert cache is not None  # Without a cache there are no keys.
+        cache.keep_figures(key, {name: getattr(optimum, name)[at] for name in _FIGURES})
+    return optimum
+
+
+_FIGURES = tuple(field.name for field in fields(FleetOptimum) if field.name != "steps")
+"""Names of the figures of a fleet that a cache keeps."""
+
+
+def _keys(sim: Simulator, steps: int) -> list[str]:
+    """Return the cache key of each fleet: a hash of configs, inputs and length of the run."""
+    fleet, drivers, sites = sim.fleet, sim.drivers, sim.fleet.sites_per_fleet
+    keys = []
+    for first in range(0, fleet.size, sites):
+        where = list(range(first, first + sites))
+        fingerprint = snapshot.fingerprint(
+            build_fleet([fleet.configs[i] for i in where]), drivers.take(where), sim.precision
+        )
+        options = {"fleet": steps, "start": drivers.start[where].tolist()}
+        keys.append(key_of(fingerprint, options))
+    return keys
 
 
 def with_room(queue_limit_tasks: float, shared: SharedWork) -> float:
@@ -519,15 +614,14 @@ def _run(
     steps: int,
     actions: Callable[[State], Actions],
     problems: Sequence[Problem],
-) -> tuple[F64, F64]:
-    """Run all data centers; return emissions in g CO2e and error of the tables, (F,) each."""
+) -> tuple[FleetScore, F64]:
+    """Run all data centers; return the score and the error of the tables, (F,)."""
     sim.reset()
     rows = {name: np.empty((steps, sim.size)) for name in ("utilisation", "setpoint_c", "kwh")}
-    carbon_g, transfer_g = np.zeros((2, sim.size))
+    score = FleetScore(sim)
     for t in range(steps):
         result = sim.step(actions(sim.state))
-        carbon_g += result.carbon_g
-        transfer_g += result.transfer_g
+        score.add(result)
         rows["utilisation"][t], rows["setpoint_c"][t] = result.utilisation, result.setpoint_c
         rows["kwh"][t] = result.facility_kwh
     off_kwh = [
@@ -539,8 +633,7 @@ def _run(
     ]
     sites = sim.fleet.sites_per_fleet
     of_fleets = np.array(off_kwh).reshape(-1, sites).sum(axis=1)
-    error = of_fleets / rows["kwh"].sum(axis=0).reshape(-1, sites).sum(axis=1)
-    return emissions_g(sim, carbon_g, transfer_g, steps), error
+    return score, of_fleets / rows["kwh"].sum(axis=0).reshape(-1, sites).sum(axis=1)
 
 
 def _sum(parts: Sequence[Linear]) -> Linear:

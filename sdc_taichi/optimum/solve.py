@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
-from pathlib import Path
 from threading import Event
 from typing import Any, TypeVar
 
@@ -17,7 +16,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.optimum.cache import Cache, Entry
+from sdc_taichi.optimum.cache import Cache, Entry, cache_in
 from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.paths import (
@@ -171,7 +170,7 @@ def solve(
             f"objective {task.objective}: heat is not planned; valid for optima are carbon, "
             "energy, cost, water, and sums of them"
         )
-    used_cache = None if cache is False else Cache(None if cache is True else Path(cache))
+    used_cache = cache_in(cache)
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
     return _optimum(task, work.entries(task, used_cache), used_cache)
 

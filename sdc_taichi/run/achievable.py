@@ -16,6 +16,7 @@ import numpy as np
 
 from sdc_taichi.control import PERFECT, Controller, ForecastError, View
 from sdc_taichi.errors import SdcError
+from sdc_taichi.optimum.fleet import FleetOptimum, FleetScore
 from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.rollout import LEAST_K, broken_constraints, loop_commands
@@ -90,6 +91,35 @@ def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
     total = float((optimum.idle - valued).sum()) / best if best > 0 else float("nan")
     broken = tuple(tuple(_broken(optimum, score, dc)) for dc in range(len(saving)))
     return Achievement(controller, score.figure, valued, share, total, broken)
+
+
+def fleet_achievement(optimum: FleetOptimum, score: FleetScore) -> Achievement:
+    """Compare the score of a run of F fleets with their known optimum.
+
+    Arrays have the shape (F,). The figure already values the work that is left at the end.
+
+    Args:
+        optimum: Known optimum of the same fleets and steps.
+        score: Score of the run.
+    """
+    figure, saving = score.figure, float((optimum.idle - optimum.achieved).sum())
+    broken = [
+        tuple(broken_constraints(dropped_more, (overdue, overdue_best), "", (0.0, 0.0)))
+        for dropped_more, overdue, overdue_best in zip(
+            score.dropped_of_fleets - optimum.idle_dropped_tasks,
+            score.overdue_of_fleets,
+            optimum.overdue_tasks,
+            strict=True,
+        )
+    ]
+    return Achievement(
+        controller="",
+        figure=figure,
+        valued_figure=figure,
+        share=share_of_achievable(figure, optimum.idle, optimum.achieved),
+        total_share=float((optimum.idle - figure).sum()) / saving if saving > 0 else float("nan"),
+        broken=tuple(broken),
+    )
 
 
 def share_of_achievable(figures: F64, idle: F64, achieved: F64) -> F64:
