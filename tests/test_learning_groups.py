@@ -25,7 +25,7 @@ from sdc_taichi.learning.algorithms import (  # noqa: E402
 )
 from sdc_taichi.learning.controller import PolicyController  # noqa: E402
 from sdc_taichi.learning.interface import interface_of  # noqa: E402
-from sdc_taichi.learning.networks import Actor, RunningMoments  # noqa: E402
+from sdc_taichi.learning.networks import Actor, Adam, RunningMoments  # noqa: E402
 from sdc_taichi.learning.on_policy import policy_loss  # noqa: E402
 from sdc_taichi.learning.policy import About, Policy  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream  # noqa: E402
@@ -95,7 +95,7 @@ def test_weights_of_happo_multiply_the_ratios_of_all_agents_that_act(
     weighed: dict[int, Tensor] = {}
     rows: list[tuple[Tensor, Tensor]] = []
 
-    def loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor:
+    def loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> tuple[Tensor, Tensor]:
         weighed[len(advantages)] = advantages
         return policy_loss(ratio, advantages, clip)
 
@@ -119,10 +119,9 @@ def test_weights_of_happo_multiply_the_ratios_of_all_agents_that_act(
 
     def log_p(of: Any) -> Tensor:
         actor = Actor(game.spaces["group"], ON, torch.Generator())
-        actor.load_state_dict(of["actor"])
+        Adam(actor.net.weights, 0.0).load_state_dict(of["actor"])
         inputs = moments.normalise(torch.cat([x for x, _ in rows]))
-        with torch.no_grad():
-            return actor.evaluate(inputs, torch.cat([x for _, x in rows]))[0]
+        return actor.evaluate(inputs, torch.cat([x for _, x in rows])).log_p
 
     ratio = (log_p(after) - log_p(before)).exp().view(tables, 3)
     product = ratio[:, 0] * ratio[:, 2]

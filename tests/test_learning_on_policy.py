@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,13 @@ from learning_games import Game, Rooms, Turnstile, assert_same_bits, weights  # 
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.learning import on_policy  # noqa: E402
 from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings  # noqa: E402
-from sdc_taichi.learning.networks import CLIP, Actor, RunningMoments, Tanh, perceptron  # noqa: E402
+from sdc_taichi.learning.networks import (  # noqa: E402
+    CLIP,
+    Actor,
+    Adam,
+    Perceptrons,
+    RunningMoments,
+)
 from sdc_taichi.learning.on_policy import (  # noqa: E402
     OnPolicy,
     generalised_advantages,
@@ -65,66 +71,123 @@ def trained(name: str, game: Game, settings: OnPolicySettings = SMALL, **more: i
 # Losses
 
 
-def actor_in_f64(*, discrete: bool, width: int = 2) -> Actor:
+@pytest.fixture
+def f64() -> Iterator[None]:
+    """Lets new tensors have double precision."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def small_actor(*, discrete: bool, width: int = 2, activation: str = "tanh") -> Actor:
     """An actor of tiny layers, none of which is near 0."""
     generator = torch.Generator().manual_seed(1)
     spaces = LearnerSpaces(("a",), 3, width, 3 if discrete else None)
-    actor: Actor = Actor(spaces, OnPolicySettings(hidden=(4,)), generator).double()
+    settings = OnPolicySettings(hidden=(4, 5), activation=activation)  # type: ignore[arg-type]
+    actor = Actor(spaces, settings, generator)
     with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator).double())
+        actor.net.weights += 0.3 * torch.randn(actor.net.weights.shape, generator=generator)
     return actor
 
 
 def samples(actor: Actor, rows: int = 12) -> tuple[Tensor, Tensor]:
     """Observations, and actions that the actor drew."""
     generator = torch.Generator().manual_seed(2)
-    seen = torch.randn(rows, 3, generator=generator, dtype=torch.float64)
-    with torch.no_grad():
-        return seen, actor.sample(seen, generator)[0]
+    seen = torch.randn(rows, 3, generator=generator)
+    return seen, actor.sample(seen, generator)[0]
 
 
-def test_tanh_and_its_gradient() -> None:
-    x = torch.linspace(-12.0, 12.0, 1001)
-    torch.testing.assert_close(Tanh()(x), x.tanh(), atol=5e-7, rtol=0)
-    exact = x[::100].double().requires_grad_()
-    assert torch.autograd.gradcheck(Tanh(), (exact,))
+@pytest.mark.usefixtures("f64")
+@pytest.mark.parametrize("discrete", [True, False])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_gradients_are_those_of_automatic_differentiation(discrete: bool, activation: str) -> None:
+    actor = small_actor(discrete=discrete, activation=activation)
+    seen, actions = samples(actor)
+    generator = torch.Generator().manual_seed(3)
+    before, gain = torch.randn(2, len(seen), generator=generator)
+    before += actor.evaluate(seen, actions).log_p
+    found = actor.evaluate(seen, actions)
+    loss, of_log_p = policy_loss((found.log_p - before).exp(), gain, 0.2)
+    assert 0 < int((of_log_p == 0).sum()) < len(seen), "some ratios are beyond the clip"
+    reached = actor.gradient(found, of_log_p, -0.1)
+
+    out = actor.net(seen)[0]
+    log_std = actor.net.weights[-out.shape[1] :]
+    each: Any = torch.distributions.Normal(out, log_std.exp())
+    if discrete:
+        each = torch.distributions.Categorical(logits=out.unflatten(-1, (-1, 3)))
+    ratio = (each.log_prob(actions).sum(-1) - before).exp()
+    surrogate = torch.minimum(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
+    torch.testing.assert_close(loss, -surrogate)
+    whole = -surrogate - 0.1 * each.entropy().sum(-1).mean()
+    torch.testing.assert_close(reached, *torch.autograd.grad(whole, actor.net.weights))
+
+
+@pytest.mark.usefixtures("f64")
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_ensembles_are_differentiable_in_weights_and_inputs(activation: str) -> None:
+    settings = OnPolicySettings(hidden=(4, 5), activation=activation)  # type: ignore[arg-type]
+    nets = Perceptrons(2, 3, 2, settings, torch.Generator().manual_seed(1))
+    seen = samples(small_actor(discrete=True))[0].requires_grad_()
+    out = nets(seen)
+    for net in range(2):
+        x = seen
+        for i, (weight, bias) in enumerate(nets.layers(nets.weights.detach())):
+            x = getattr(torch, activation)(x) if i else x
+            x = x @ weight[net] + bias[net]
+        torch.testing.assert_close(out[net], x)
+    assert torch.autograd.gradcheck(nets, (seen, nets.weights))
+
+
+def test_adam_is_that_of_pytorch() -> None:
+    generator = torch.Generator().manual_seed(0)
+    ours = torch.randn(9, generator=generator).requires_grad_()
+    theirs = ours.detach().clone().requires_grad_()
+    mine, other = Adam(ours, 0.1, 2.0, 1e-5), torch.optim.Adam([theirs], 0.1, eps=1e-5)
+    for size in (0.1, 10.0, 1.0):
+        gradient = size * torch.randn(9, generator=generator)
+        theirs.grad = gradient.clone()
+        torch.nn.utils.clip_grad_norm_([theirs], 2.0)
+        other.step()
+        mine.step(gradient)
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_ratios_beyond_the_clip_pay_no_more() -> None:
     def loss(ratio: float, advantage: float) -> float:
-        return float(policy_loss(torch.tensor([ratio]), torch.tensor([advantage]), 0.2))
+        return float(policy_loss(torch.tensor([ratio]), torch.tensor([advantage]), 0.2)[0])
 
     assert loss(1.5, 1.0) == pytest.approx(-1.2)
     assert loss(0.5, -1.0) == pytest.approx(0.8)
     assert loss(0.5, 1.0) == pytest.approx(-0.5)
     assert loss(1.5, -1.0) == pytest.approx(1.5)
-    assert float(policy_loss(torch.tensor([1.5]), torch.ones(1), None)) == pytest.approx(-1.5)
+    assert float(policy_loss(torch.tensor([1.5]), torch.ones(1), None)[0]) == pytest.approx(-1.5)
 
 
+@pytest.mark.usefixtures("f64")
 @pytest.mark.parametrize("discrete", [True, False])
 def test_probabilities_and_entropy_are_those_of_independent_numbers(discrete: bool) -> None:
-    actor = actor_in_f64(discrete=discrete, width=3)
+    actor = small_actor(discrete=discrete, width=3)
     seen, actions = samples(actor)
-    log_p, entropy = actor.evaluate(seen, actions)
-    out = actor.net(seen)
+    found = actor.evaluate(seen, actions)
+    out = actor.net(seen)[0]
     if discrete:
         each: Any = torch.distributions.Categorical(logits=out.unflatten(-1, (3, 3)))
     else:
         each = torch.distributions.Normal(out, actor.log_std.exp())
-    torch.testing.assert_close(log_p, each.log_prob(actions).sum(-1))
-    torch.testing.assert_close(entropy, each.entropy().sum(-1).mean())
+    torch.testing.assert_close(found.log_p, each.log_prob(actions).sum(-1))
+    torch.testing.assert_close(found.entropy, each.entropy().sum(-1).mean())
 
 
 def test_actions_are_drawn_as_often_as_they_are_probable() -> None:
-    actor = actor_in_f64(discrete=True)
+    actor = small_actor(discrete=True)
     seen = samples(actor, 1)[0].expand(20_000, -1)
     actions, log_p = actor.sample(seen, torch.Generator().manual_seed(5))
-    probabilities = actor.net(seen[0]).unflatten(-1, (2, 3)).softmax(-1)
+    probabilities = actor.net(seen[:1])[0, 0].unflatten(-1, (2, 3)).softmax(-1)
     for number in range(2):
         drawn = torch.bincount(actions[:, number], minlength=3) / len(actions)
-        torch.testing.assert_close(drawn.double(), probabilities[number], atol=0.02, rtol=0)
-    torch.testing.assert_close(log_p, actor.evaluate(seen, actions)[0])
+        torch.testing.assert_close(drawn, probabilities[number], atol=0.02, rtol=0)
+    torch.testing.assert_close(log_p, actor.evaluate(seen, actions).log_p)
 
 
 # Advantages and normalisation
@@ -148,14 +211,12 @@ def test_advantages_are_those_of_a_plain_loop_and_stop_where_an_episode_does() -
 
 def critic_says(values: Mapping[str, Any], inputs: Mapping[str, Any], seen: Tensor) -> Tensor:
     """Value that a critic's ``state_dict`` gives what is seen, in rewards."""
-    of_layers = {"activation": "tanh", "last_gain": 1.0, "generator": torch.Generator()}
-    net = perceptron(seen.shape[-1], SMALL.hidden, 1, **of_layers)
-    net.load_state_dict(values["net"])
+    net = Perceptrons(1, seen.shape[-1], 1, SMALL, torch.Generator())
     moments, returns = RunningMoments(seen.shape[-1]), RunningMoments(1)
     moments.load_state_dict(dict(inputs))
     returns.load_state_dict(values["returns"])
-    with torch.no_grad():
-        return net(moments.normalise(seen)).squeeze(-1) * returns.std + returns.mean.float()
+    value = net(moments.normalise(seen), values["adam"]["weights"])[0, :, 0]
+    return value * returns.std + returns.mean.float()
 
 
 def test_values_go_on_beyond_the_end_of_an_episode_and_not_into_the_next() -> None:
@@ -210,7 +271,7 @@ def test_advantages_are_weighed_by_the_ratios_of_learners_before(
     weighed: list[Tensor] = []
     rows: list[tuple[Tensor, dict[str, Tensor]]] = []
 
-    def loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor:
+    def loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> tuple[Tensor, Tensor]:
         weighed.append(advantages)
         return policy_loss(ratio, advantages, clip)
 
@@ -228,12 +289,11 @@ def test_advantages_are_weighed_by_the_ratios_of_learners_before(
 
     def log_p(of: Mapping[str, Any], learner: str) -> Tensor:
         actor = Actor(game.spaces[learner], SMALL, torch.Generator())
-        actor.load_state_dict(of[learner]["actor"])
+        Adam(actor.net.weights, 0.0).load_state_dict(of[learner]["actor"])
         moments = RunningMoments(3)
         moments.load_state_dict(before[learner]["moments"])
         made = torch.cat([actions[learner] for _, actions in rows])
-        with torch.no_grad():
-            return actor.evaluate(moments.normalise(seen), made)[0]
+        return actor.evaluate(moments.normalise(seen), made).log_p
 
     product = torch.ones(len(seen))
     for learner, found in zip(order, weighed, strict=True):

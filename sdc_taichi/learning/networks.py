@@ -12,8 +12,9 @@ critics.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +43,8 @@ LEAST_STD = 1e-2
 """Lower bound of the standard deviation for normalisation; nearly constant inputs stay small."""
 CLIP = 10.0
 """Maximum absolute value of a normalised input."""
+MEAN_SHARE, SQUARE_SHARE = 0.9, 0.999
+"""Shares of the previous values in the moving averages of Adam (beta_1 and beta_2)."""
 LAST_GAIN = 0.01
 """Gain of the last layer's initial weights; small, so that the initial outputs are near 0."""
 
@@ -56,17 +59,11 @@ class RunningMoments:
         mean: mean of each column, (width,).
         variance: variance of each column, (width,).
         count: number of added rows.
+        std: standard deviation of each column, at least ``LEAST_STD``, (width,), f32.
     """
 
     def __init__(self, width: int) -> None:
-        self.mean = torch.zeros(width, dtype=torch.float64)
-        self.variance = torch.ones(width, dtype=torch.float64)
-        self.count = 0
-
-    @property
-    def std(self) -> Tensor:
-        """Standard deviation of each column, at least ``LEAST_STD``, (width,), f32."""
-        return self.variance.sqrt().clamp_min(LEAST_STD).float()
+        self._set(torch.zeros(width), torch.ones(width), 0)
 
     def add(self, rows: Tensor) -> None:
         """Update the moments with rows, (n, width)."""
@@ -80,17 +77,16 @@ class RunningMoments:
         total = self.count + n
         shift = mean - self.mean
         weight = self.count / total
-        self.variance = (
+        variance = (
             weight * self.variance
             + (1.0 - weight) * variance
             + weight * (1.0 - weight) * shift * shift
         )
-        self.mean = self.mean + (1.0 - weight) * shift
-        self.count = total
+        self._set(self.mean + (1.0 - weight) * shift, variance, total)
 
     def normalise(self, values: Tensor) -> Tensor:
         """Subtract the mean, divide by the standard deviation, and clip to -CLIP..CLIP."""
-        return ((values - self.mean.float()) / self.std).clamp_(-CLIP, CLIP)
+        return (values - self._mean).div_(self.std).clamp_(-CLIP, CLIP)
 
     def state_dict(self) -> dict[str, object]:
         """Return the moments, for ``load_state_dict``."""
@@ -98,84 +94,209 @@ class RunningMoments:
 
     def load_state_dict(self, values: dict[str, object]) -> None:
         """Restore the moments that ``state_dict`` returned."""
-        self.mean, self.variance = _tensor(values["mean"]), _tensor(values["variance"])
-        self.count = int(str(values["count"]))
+        self._set(values["mean"], values["variance"], int(str(values["count"])))
+
+    def _set(self, mean: object, variance: object, count: int) -> None:
+        self.mean = torch.as_tensor(mean, dtype=torch.float64)
+        self.variance = torch.as_tensor(variance, dtype=torch.float64)
+        self.count = count
+        self._mean = self.mean.float()
+        self.std = self.variance.sqrt().clamp_min(LEAST_STD).float()
 
 
-def _tensor(value: object) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64).clone()
+class Adam:
+    """Optimiser Adam (Kingma and Ba 2015) of one tensor, with limited norms of gradients.
 
+    Args:
+        weights: tensor to update.
+        rate: learning rate.
+        norm: maximum norm of a gradient; larger gradients are scaled down.
+        epsilon: lower bound of the divisor of a step.
 
-class _TanhBySigmoid(torch.autograd.Function):
-    """Hyperbolic tangent computed from the logistic function s, tanh(x) = 2 s(2 x) - 1.
-
-    On processors with AVX-512, PyTorch's logistic function is six times as fast as its tanh.
+    Attributes:
+        rate: learning rate.
     """
 
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        out = (2.0 * x).sigmoid_().mul_(2.0).sub_(1.0)
-        ctx.save_for_backward(out)
-        return out
+    def __init__(
+        self, weights: Tensor, rate: float, norm: float = math.inf, epsilon: float = 1e-8
+    ) -> None:
+        self.rate, self._norm, self._epsilon = rate, norm, epsilon
+        self._leaf, self._weights = weights, weights.detach()
+        self._mean, self._square = torch.zeros_like(weights), torch.zeros_like(weights)
+        self._steps = 0
 
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        (out,) = ctx.saved_tensors
-        return torch.ops.aten.tanh_backward(gradients[0], out)
+    def descend(self, loss: Tensor) -> None:
+        """Take a step that lowers a loss, shape (); no other gradient is computed."""
+        self.step(*torch.autograd.grad(loss, self._leaf))
+
+    def step(self, gradient: Tensor) -> None:
+        """Take a step against the gradient of the weights."""
+        norm = float(torch.linalg.vector_norm(gradient))
+        if norm > self._norm:
+            gradient = gradient * (self._norm / norm)
+        self._steps += 1
+        self._mean.lerp_(gradient, 1.0 - MEAN_SHARE)
+        self._square.mul_(SQUARE_SHARE).addcmul_(gradient, gradient, value=1.0 - SQUARE_SHARE)
+        size = (self._square / (1.0 - SQUARE_SHARE**self._steps)).sqrt_().add_(self._epsilon)
+        rate = self.rate / (1.0 - MEAN_SHARE**self._steps)
+        self._weights.addcdiv_(self._mean, size, value=-rate)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return weights and moments, for ``load_state_dict``."""
+        moments = {"mean": self._mean, "square": self._square, "steps": self._steps}
+        return {"weights": self._weights, **moments}
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Restore weights and moments that ``state_dict`` returned."""
+        self._weights.copy_(torch.as_tensor(values["weights"]))
+        self._mean.copy_(torch.as_tensor(values["mean"]))
+        self._square.copy_(torch.as_tensor(values["square"]))
+        self._steps = int(values["steps"])
 
 
-class Tanh(nn.Module):
-    """Layer with the hyperbolic tangent, equal to ``torch.tanh`` except for rounding."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the hyperbolic tangent of each element of x."""
-        return _TanhBySigmoid.apply(x)
-
-
-ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU}
 FIRST_STD = 0.5
 """Standard deviation of continuous actions before training."""
 
 
-def perceptron(
-    width: int,
-    hidden: Sequence[int],
-    out: int,
-    *,
-    activation: str,
-    last_gain: float,
-    generator: torch.Generator,
-) -> nn.Sequential:
-    """Return a perceptron with orthogonal initial weights (Saxe et al. 2014) and biases of 0.
+class Perceptrons:
+    """Ensemble of E perceptrons of equal shape, evaluated together.
+
+    Initial weights are orthogonal (Saxe et al. 2014), and initial biases are 0. ``run`` and
+    ``gradient`` take less time than automatic differentiation, as calls of small operations do.
 
     Args:
-        width: number of inputs.
-        hidden: number of units in each hidden layer.
-        out: number of outputs.
-        activation: activation function of all layers except the last, ``tanh`` or ``relu``.
-        last_gain: gain of the weights of the last layer.
+        number: number of perceptrons, E.
+        width: number of inputs of each perceptron.
+        out: number of outputs of each perceptron.
+        settings: settings of the algorithm, with hidden layers and activation function.
         generator: random generator of the initial weights.
+        last_gain: gain of the weights of the last layer.
+        further: number of further parameters of the caller.
+
+    Attributes:
+        weights: weights and biases of all layers in one tensor, and then the further parameters.
     """
-    layers: list[nn.Module] = []
-    for units in hidden:
-        layers += [_linear(width, units, math.sqrt(2.0), generator), ACTIVATIONS[activation]()]
-        width = units
-    return nn.Sequential(*layers, _linear(width, out, last_gain, generator))
+
+    def __init__(
+        self,
+        number: int,
+        width: int,
+        out: int,
+        settings: OnPolicySettings | OffPolicySettings,
+        generator: torch.Generator,
+        *,
+        last_gain: float = LAST_GAIN,
+        further: int = 0,
+    ) -> None:
+        self._number, self._is_tanh = number, settings.activation == "tanh"
+        self._shapes: list[tuple[int, int, int]] = []
+        for before, after in pairwise((width, *settings.hidden, out)):
+            self._shapes += [(number, before, after), (number, 1, after)]
+        ends = [0, *accumulate(map(math.prod, self._shapes))]
+        self._places = [slice(*places) for places in pairwise(ends)]
+        self.weights = torch.zeros(ends[-1] + further, requires_grad=True)
+        self._flat = self.weights.detach()
+        self._layers = self.layers(self._flat)
+        for i, (weights, _) in enumerate(self._layers):
+            gain = last_gain if i == len(settings.hidden) else math.sqrt(2.0)
+            for weight in weights:
+                nn.init.orthogonal_(weight, gain, generator=generator)
+
+    def __call__(self, inputs: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the outputs of all perceptrons, (E, N, out), for automatic differentiation.
+
+        Args:
+            inputs: inputs, the same for all perceptrons, (N, width).
+            weights: weights to use in place of the attribute, such as those of a target network.
+        """
+        used = self.weights if weights is None else weights
+        out: Tensor = _Outputs.apply(inputs.expand(self._number, -1, -1), used, self)
+        return out
+
+    def layers(self, weights: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return views of weights: weight, (E, in, out), and bias, (E, 1, out), of each layer.
+
+        Args:
+            weights: tensor like the attribute.
+        """
+        parts = zip(self._places, self._shapes, strict=True)
+        views = [weights[place].view(shape) for place, shape in parts]
+        return list(zip(views[::2], views[1::2], strict=True))
+
+    def run(self, inputs: Tensor, weights: Tensor | None = None) -> list[Tensor]:
+        """Return the inputs of each layer, (E, N, in) each, and the outputs, (E, N, out).
+
+        Args:
+            inputs: inputs, (E, N, width).
+            weights: weights to use in place of the attribute.
+        """
+        values = [inputs]
+        layers = self._layers if weights is None else self.layers(weights)
+        for i, (weight, bias) in enumerate(layers):
+            if i:
+                values[i] = values[i].tanh_() if self._is_tanh else values[i].relu_()
+            values.append(torch.baddbmm(bias, values[i], weight))
+        return values
+
+    def gradient(
+        self,
+        values: Sequence[Tensor],
+        of_out: Tensor,
+        weights: Tensor | None = None,
+        of_inputs: Tensor | None = None,
+    ) -> Tensor:
+        """Return the gradient of the weights; that of further parameters is 0.
+
+        Args:
+            values: inputs of each layer, as ``run`` returned them.
+            of_out: gradient of the outputs, (E, N, out).
+            weights: weights to use in place of the attribute.
+            of_inputs: tensor that receives the gradient of the inputs, (E, N, width); None if that
+                gradient is not needed.
+        """
+        gradient = torch.zeros_like(self._flat)
+        layers = self._layers if weights is None else self.layers(weights)
+        parts = list(zip(layers, self.layers(gradient), values, strict=False))
+        for i, ((weight, _), (of_weight, of_bias), inputs) in reversed(list(enumerate(parts))):
+            torch.bmm(inputs.transpose(1, 2), of_out, out=of_weight)
+            torch.sum(of_out, 1, keepdim=True, out=of_bias)
+            if i:
+                of_out = torch.bmm(of_out, weight.transpose(1, 2))
+                if self._is_tanh:
+                    _TANH_BACKWARD(of_out, inputs, grad_input=of_out)
+                else:
+                    _RELU_BACKWARD(of_out, inputs, 0, grad_input=of_out)
+            elif of_inputs is not None:
+                torch.bmm(of_out, weight.transpose(1, 2), out=of_inputs)
+        return gradient
 
 
-def _linear(width: int, out: int, gain: float, generator: torch.Generator) -> nn.Linear:
-    layer = nn.utils.skip_init(nn.Linear, width, out)
-    nn.init.orthogonal_(layer.weight, gain, generator=generator)
-    nn.init.zeros_(layer.bias)
-    return layer
+_TANH_BACKWARD = torch.ops.aten.tanh_backward.grad_input
+_RELU_BACKWARD = torch.ops.aten.threshold_backward.grad_input
 
 
-def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
-    """Return copies of each layer's weight, (out, in), and bias, (out,)."""
+class _Outputs(torch.autograd.Function):
+    """Outputs of perceptrons for automatic differentiation."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, weights: Tensor, net: Perceptrons) -> Tensor:
+        *values, out = net.run(inputs, weights)
+        ctx.net = net
+        ctx.save_for_backward(weights, *values)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
+        weights, *values = ctx.saved_tensors
+        of_inputs = torch.empty_like(values[0]) if ctx.needs_input_grad[0] else None
+        return of_inputs, ctx.net.gradient(values, gradients[0], weights, of_inputs), None
+
+
+def layers_of(net: Perceptrons) -> tuple[tuple[F32, F32], ...]:
+    """Return copies of each layer's weight, (out, in), and bias, (out,), of a single perceptron."""
     return tuple(
-        (layer.weight.detach().float().numpy().copy(), layer.bias.detach().float().numpy().copy())
-        for layer in net
-        if isinstance(layer, nn.Linear)
+        (weight[0].T.float().numpy().copy(), bias[0, 0].float().numpy().copy())
+        for weight, bias in net.layers(net.weights.detach())
     )
 
 
@@ -210,7 +331,20 @@ def policy_network(
     )
 
 
-class Actor(nn.Module):
+class Evaluation(NamedTuple):
+    """Probability of N actions, with the values that the gradients are computed from."""
+
+    log_p: Tensor
+    """Logarithm of the joint probability of the k actions, (N,)."""
+    entropy: Tensor
+    """Mean entropy of the policy, shape ()."""
+    values: list[Tensor]
+    """Inputs and outputs of the layers of the network."""
+    parts: tuple[Tensor, ...]
+    """Intermediate results."""
+
+
+class Actor:
     """Stochastic policy of a learner: a distribution of its k actions for each observation.
 
     The k actions are independent. Discrete actions have categorical distributions. Continuous
@@ -225,19 +359,12 @@ class Actor(nn.Module):
     def __init__(
         self, spaces: LearnerSpaces, settings: OnPolicySettings, generator: torch.Generator
     ) -> None:
-        super().__init__()
         self.choices = spaces.choices
-        outputs = spaces.action_width * (spaces.choices or 1)
-        self.net = perceptron(
-            spaces.observation_width,
-            settings.hidden,
-            outputs,
-            activation=settings.activation,
-            last_gain=LAST_GAIN,
-            generator=generator,
-        )
+        width, outputs = spaces.observation_width, spaces.action_width * (spaces.choices or 1)
+        further = outputs if spaces.choices is None else 0
+        self.net = Perceptrons(1, width, outputs, settings, generator, further=further)
         if spaces.choices is None:
-            self.log_std = nn.Parameter(torch.full((outputs,), math.log(FIRST_STD)))
+            self.log_std = self.net.weights.detach()[-outputs:].fill_(math.log(FIRST_STD))
 
     def sample(self, observations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw actions.
@@ -250,101 +377,81 @@ class Actor(nn.Module):
             Actions, (B, k), and the logarithm of their joint probability, (B,). Continuous actions
             can be outside -1..1.
         """
-        out = self.net(observations)
+        out = self.net.run(observations[None])[-1][0]
         if self.choices is not None:
             log_p = self._log_probabilities(out)
-            noise = torch.empty(log_p.shape, dtype=log_p.dtype).exponential_(generator=generator)
-            actions = (log_p - noise.log_()).argmax(-1)
-            return actions, _of_chosen(log_p, actions)
-        std = self.log_std.exp()
+            noise = torch.empty_like(log_p).exponential_(generator=generator)
+            actions = (log_p - noise.log_()).argmax(1)
+            return actions.T, _of_chosen(log_p, actions.unsqueeze(1))
         noise = torch.randn(out.shape, generator=generator, dtype=out.dtype)
-        actions = out + std * noise
-        return actions, self._log_density(noise)
+        return out + self.log_std.exp() * noise, self._log_density(noise)
 
-    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the log-probability of actions, (B,), and the mean entropy of the policy, ().
+    def evaluate(self, observations: Tensor, actions: Tensor) -> Evaluation:
+        """Return the log-probability of actions and the entropy of the policy.
 
         Args:
-            observations: normalised observations, (B, n).
-            actions: actions, (B, k).
+            observations: normalised observations, (N, n).
+            actions: actions, (N, k).
         """
-        out = self.net(observations)
+        values = self.net.run(observations[None])
+        out = values[-1][0]
         if self.choices is not None:
-            log_p = self._log_probabilities(out)
-            return _of_chosen(log_p, actions), -(log_p.exp() * log_p).sum((-1, -2)).mean()
+            log_p, chosen = self._log_probabilities(out), actions.T.unsqueeze(1)
+            p = log_p.exp()
+            weighted = p * log_p
+            each = weighted.sum(1, keepdim=True)
+            entropy = -each.sum() / len(out)
+            return Evaluation(
+                _of_chosen(log_p, chosen), entropy, values, (chosen, p, weighted, each)
+            )
+        deviation = (actions - out) / self.log_std.exp()
         entropy = (self.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
-        return self._log_density((actions - out) / self.log_std.exp()), entropy
+        return Evaluation(self._log_density(deviation), entropy, values, (deviation,))
+
+    def gradient(self, evaluation: Evaluation, of_log_p: Tensor, of_entropy: float) -> Tensor:
+        """Return the gradient of a loss for all weights; the evaluation is used up.
+
+        Args:
+            evaluation: result of ``evaluate``.
+            of_log_p: derivative of the loss for the log-probability of each action, (N,).
+            of_entropy: derivative of the loss for the mean entropy.
+        """
+        if self.choices is not None:
+            chosen, p, weighted, each = evaluation.parts
+            share = -of_entropy / len(of_log_p)
+            # The derivative of log_p for out is 1 (of the chosen option) less p, and that of the
+            # entropy is p (each - log p).
+            of_out = weighted.mul_(share).addcmul_(
+                p, torch.add(of_log_p, each, alpha=share), value=-1
+            )
+            of_out.scatter_add_(1, chosen, of_log_p.expand(chosen.shape))
+            return self.net.gradient(evaluation.values, of_out.flatten(0, 1).T[None])
+        (deviation,) = evaluation.parts
+        of_out = of_log_p[:, None] * deviation / self.log_std.exp()
+        gradient = self.net.gradient(evaluation.values, of_out[None])
+        of_log_std = (of_log_p[:, None] * (deviation.square() - 1.0)).sum(0) + of_entropy
+        gradient[-len(of_log_std) :] = of_log_std
+        return gradient
 
     def _log_probabilities(self, out: Tensor) -> Tensor:
-        """Return the log-probability of each option of each action, (B, k, choices)."""
+        """Return the log-probability of each option of each action, (k, choices, N)."""
         # log_softmax along a short last axis takes ten times as long as along a short first axis.
-        by_choice = out.unflatten(-1, (-1, self.choices)).movedim(-1, 0).contiguous()
-        return by_choice.log_softmax(0).movedim(0, -1)
+        by_choice = out.T.contiguous().unflatten(0, (-1, self.choices))
+        return by_choice.log_softmax(1)
 
-    def _log_density(self, noise: Tensor) -> Tensor:
-        """Return the log-density of actions, (B,), from standardised deviations from the mean."""
-        each = -0.5 * noise * noise - self.log_std - 0.5 * math.log(2.0 * math.pi)
+    def _log_density(self, deviation: Tensor) -> Tensor:
+        """Return the log-density of actions, (N,), from standardised deviations from the mean."""
+        each = -0.5 * deviation * deviation - self.log_std - 0.5 * math.log(2.0 * math.pi)
         return each.sum(-1)
 
 
-def _of_chosen(log_p: Tensor, actions: Tensor) -> Tensor:
-    """Return the joint log-probability of the chosen options, (B,)."""
-    return log_p.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)
+def _of_chosen(log_p: Tensor, chosen: Tensor) -> Tensor:
+    """Return the joint log-probability of chosen options, (k, 1, N), as (N,)."""
+    return log_p.gather(1, chosen).sum((0, 1))
 
 
 MOST_JOINT_ACTIONS = 729
 """Maximum number of joint actions, and so of critic outputs: 3^6, six actions of three options."""
-
-
-class Perceptrons:
-    """Ensemble of E perceptrons of equal shape, evaluated together.
-
-    Args:
-        number: number of perceptrons, E.
-        width: number of inputs of each perceptron.
-        out: number of outputs of each perceptron.
-        settings: settings of the algorithm, with hidden layers and activation function.
-        generator: random generator of the orthogonal initial weights (Saxe et al. 2014).
-
-    Attributes:
-        parameters: weights, (E, in, out), and biases, (E, 1, out), layer by layer.
-    """
-
-    def __init__(
-        self,
-        number: int,
-        width: int,
-        out: int,
-        settings: OffPolicySettings,
-        generator: torch.Generator,
-    ) -> None:
-        self.parameters: list[Tensor] = []
-        self._activation = {"tanh": torch.tanh, "relu": torch.relu}[settings.activation]
-        for units in (*settings.hidden, out):
-            weights = torch.empty(number, width, units)
-            gain = LAST_GAIN if len(self.parameters) == 2 * len(settings.hidden) else math.sqrt(2.0)
-            for weight in weights:
-                torch.nn.init.orthogonal_(weight, gain, generator=generator)
-            self.parameters += [weights, torch.zeros(number, 1, units)]
-            width = units
-        for parameter in self.parameters:
-            parameter.requires_grad_()
-
-    def __call__(self, inputs: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
-        """Return the outputs of all perceptrons, (E, N, out).
-
-        Args:
-            inputs: inputs, the same for all perceptrons, (N, width).
-            parameters: parameters to use in place of the attribute, such as those of a target
-                network.
-        """
-        used = self.parameters if parameters is None else parameters
-        x = inputs.expand(len(used[0]), *inputs.shape)
-        for i in range(0, len(used), 2):
-            if i:
-                x = self._activation(x)
-            x = torch.baddbmm(used[i + 1], x, used[i])
-        return x
 
 
 class JointValues:
@@ -365,7 +472,7 @@ class JointValues:
         levels: number of options of each choice, L.
 
     Attributes:
-        parameters: weights and biases of the critics.
+        weights: weights and biases of the critics.
 
     Raises:
         ConfigError: there are more than ``MOST_JOINT_ACTIONS`` joint actions.
@@ -394,34 +501,30 @@ class JointValues:
         self._of_choices = one_hot.T.float()
         out = 1 + levels * choices + joint_actions
         self._nets = Perceptrons(number, width, out, settings, generator)
-        self.parameters = self._nets.parameters
+        self.weights = self._nets.weights
 
-    def __call__(self, state: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
+    def __call__(self, state: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the values of all joint actions, (E, N, L^K); the last choice varies fastest.
 
         Args:
             state: states, (N, width).
-            parameters: parameters to use in place of the attribute, such as those of a target
-                network.
+            weights: weights to use in place of the attribute, such as those of a target network.
         """
-        out = self._nets(state, parameters)
+        out = self._nets(state, weights)
         of_choices = len(self._of_choices)
         advantage = out[..., 1 : 1 + of_choices] @ self._of_choices.to(out.dtype)
         advantage = advantage + out[..., 1 + of_choices :]
         return out[..., :1] + advantage - advantage.mean(-1, keepdim=True)
 
-    def of_actions(
-        self, state: Tensor, actions: Tensor, parameters: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def of_actions(self, state: Tensor, actions: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the values of joint actions, (E, N).
 
         Args:
             state: states, (N, width).
             actions: chosen options, (N, K).
-            parameters: parameters to use in place of the attribute, such as those of a target
-                network.
+            weights: weights to use in place of the attribute, such as those of a target network.
         """
-        table = self(state, parameters)
+        table = self(state, weights)
         joint = (actions.long() * self._places).sum(-1)
         return table.gather(-1, joint.expand(len(table), -1).unsqueeze(-1)).squeeze(-1)
 
@@ -437,7 +540,7 @@ class ContinuousValues:
         generator: random generator of the initial weights.
 
     Attributes:
-        parameters: weights and biases of the critics.
+        weights: weights and biases of the critics.
     """
 
     def __init__(
@@ -449,20 +552,17 @@ class ContinuousValues:
         generator: torch.Generator,
     ) -> None:
         self._nets = Perceptrons(number, width + numbers, 1, settings, generator)
-        self.parameters = self._nets.parameters
+        self.weights = self._nets.weights
 
-    def of_actions(
-        self, state: Tensor, actions: Tensor, parameters: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def of_actions(self, state: Tensor, actions: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the values of joint actions, (E, N).
 
         Args:
             state: states, (N, width).
             actions: actions within -1..1, (N, K).
-            parameters: parameters to use in place of the attribute, such as those of a target
-                network.
+            weights: weights to use in place of the attribute, such as those of a target network.
         """
-        return self._nets(torch.cat([state, actions], dim=-1), parameters).squeeze(-1)
+        return self._nets(torch.cat([state, actions], dim=-1), weights).squeeze(-1)
 
 
 def expected(table: Tensor, probabilities: Tensor, free: Collection[int] = ()) -> Tensor:

@@ -40,6 +40,7 @@ from torch import Tensor
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.algorithms import OffPolicyDefinition, OffPolicySettings, own_share
 from sdc_taichi.learning.networks import (
+    Adam,
     ContinuousValues,
     JointValues,
     RunningMoments,
@@ -52,8 +53,6 @@ from sdc_taichi.learning.off_policy_actors import (
     GreedyActors,
     Situation,
     SoftActors,
-    adam,
-    descend,
 )
 from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.stream import (
@@ -109,8 +108,8 @@ class OffPolicy:
             rewards,
             self._generators["weights"],
         )
-        self._targets = [x.detach().clone() for x in self._critic.parameters]
-        self._adam = adam(self._critic.parameters, settings.rate)
+        self._targets = self._critic.weights.detach().clone()
+        self._adam = Adam(self._critic.weights, settings.rate, settings.gradient_norm)
         plain = [STATE, *(name for name, of in self._spaces.items() if not _has_rows(of))]
         self._plain = slice(self._columns[plain[-1]].stop)
         self._moments = RunningMoments(self._plain.stop)
@@ -173,9 +172,8 @@ class OffPolicy:
         return {
             "done": self._done,
             "generators": {n: g.get_state() for n, g in self._generators.items()},
-            "critic": {str(i): x.detach() for i, x in enumerate(self._critic.parameters)},
-            "targets": {str(i): x for i, x in enumerate(self._targets)},
-            "adam": self._adam.state_dict(),
+            "critic": self._adam.state_dict(),
+            "targets": self._targets,
             "actors": self._actors.state_dict(),
             "moments": {n: m.state_dict() for n, m in self._all_moments().items()},
             "running_return": self._running_return,
@@ -187,11 +185,8 @@ class OffPolicy:
         self._done = int(values["done"])
         for name, generator in self._generators.items():
             generator.set_state(values["generators"][name])
-        with torch.no_grad():
-            for i, parameter in enumerate(self._critic.parameters):
-                parameter.copy_(values["critic"][str(i)])
-                self._targets[i].copy_(values["targets"][str(i)])
-        self._adam.load_state_dict(values["adam"])
+        self._adam.load_state_dict(values["critic"])
+        self._targets.copy_(torch.as_tensor(values["targets"]))
         self._actors.load_state_dict(values["actors"])
         for name, moments in self._all_moments().items():
             moments.load_state_dict(values["moments"][name])
@@ -306,7 +301,7 @@ class OffPolicy:
         if self._settings.anneal:
             rate = self._settings.rate * max(0.0, 1.0 - self._done / self._updates)
             for optimiser in (self._adam, *self._actors.adams.values()):
-                optimiser.param_groups[0]["lr"] = rate
+                optimiser.rate = rate
 
     def _learn(self, replay: Replay) -> dict[str, Tensor]:
         """Take a gradient step of the critics and of each learner, and update the target critics.
@@ -319,11 +314,9 @@ class OffPolicy:
         with torch.no_grad():
             targets = self._critic_targets(drawn, after)
         loss = critic_loss(self._critic.of_actions(before.state, drawn.actions), targets)
-        descend(loss, self._critic.parameters, self._adam, s.gradient_norm)
+        self._adam.descend(loss)
         logged = self._actors.improve(before, self._generators["order"])
-        with torch.no_grad():
-            for slow, parameter in zip(self._targets, self._critic.parameters, strict=True):
-                slow.lerp_(parameter, s.target_rate)
+        self._targets.lerp_(self._critic.weights.detach(), s.target_rate)
         return {"critic_loss": loss.detach(), **logged}
 
     def _critic_targets(self, drawn: Transitions, after: Situation) -> Tensor:

@@ -23,11 +23,11 @@ from torch import Tensor, nn
 
 from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.networks import (
-    LAST_GAIN,
+    Adam,
     ContinuousValues,
     JointValues,
+    Perceptrons,
     expected,
-    perceptron,
 )
 from sdc_taichi.learning.stream import LearnerSpaces
 
@@ -94,36 +94,28 @@ class Actors(Generic[Values]):
         self._critic, self._settings, self._rewards = critic, settings, rewards
         self._reward_of = {name: i if rewards > 1 else 0 for i, name in enumerate(spaces)}
         self._outputs = next(iter(spaces.values())).choices or 2
-        self.nets: dict[str, nn.Sequential] = {}
+        self.nets: dict[str, Perceptrons] = {}
         self.numbers: dict[str, slice] = {}
-        self.adams: dict[str, torch.optim.Adam] = {}
+        self.adams: dict[str, Adam] = {}
         self._counts = {name: of.count for name, of in spaces.items()}
         first = 0
         for name, of in spaces.items():
-            self.nets[name] = net = perceptron(
-                of.observation_width,
-                settings.hidden,
-                self._outputs * of.action_width,
-                activation=settings.activation,
-                last_gain=LAST_GAIN,
-                generator=generator,
+            outputs = self._outputs * of.action_width
+            self.nets[name] = net = Perceptrons(
+                1, of.observation_width, outputs, settings, generator
             )
-            self.adams[name] = adam(net.parameters(), settings.rate)
+            self.adams[name] = Adam(net.weights, settings.rate, settings.gradient_norm)
             self.numbers[name] = slice(first, first + of.action_width * of.count)
             first = self.numbers[name].stop
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that ``load_state_dict`` needs."""
-        return {
-            name: {"net": net.state_dict(), "adam": self.adams[name].state_dict()}
-            for name, net in self.nets.items()
-        }
+        return {name: adam.state_dict() for name, adam in self.adams.items()}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """Restore the state that ``state_dict`` returned."""
-        for name, net in self.nets.items():
-            net.load_state_dict(values[name]["net"])
-            self.adams[name].load_state_dict(values[name]["adam"])
+        for name, adam in self.adams.items():
+            adam.load_state_dict(values[name])
 
     def _choice_outputs(self, situation: Situation) -> Tensor:
         """Return the network output for each level of each action, (N, K, L)."""
@@ -146,12 +138,6 @@ class Actors(Generic[Values]):
     def _least(self, values: Tensor) -> Tensor:
         """Return the least value of the critics of each reward, (Z, N, ...), from (Z E, N, ...)."""
         return values.unflatten(0, (self._rewards, -1)).amin(1)
-
-    def _descend(self, loss: Tensor, name: str) -> None:
-        """Take a gradient step of a learner's network."""
-        descend(
-            loss, list(self.nets[name].parameters()), self.adams[name], self._settings.gradient_norm
-        )
 
     def _order(self, generator: torch.Generator) -> list[str]:
         """Return the names of the learners in random order."""
@@ -187,9 +173,7 @@ class GreedyActors(Actors[JointValues]):
                 chosen[:, numbers] *= acting
         return chosen
 
-    def next_values(
-        self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
-    ) -> Tensor:
+    def next_values(self, targets: Tensor, after: Situation, _: torch.Generator) -> Tensor:
         """Return the target critic's values of the learners' best choices, (Z, N).
 
         Selection by the learners and evaluation by the critic is double Q-learning (van Hasselt et
@@ -215,7 +199,7 @@ class GreedyActors(Actors[JointValues]):
             errors = (outputs[:, numbers] - rows[:, numbers]).square()
             acting = situation.acting(name, errors.shape[1])
             loss = errors.mean() if acting is None else _mean_of(errors.mean(-1), acting)
-            self._descend(loss, name)
+            self.adams[name].descend(loss)
             losses[f"policy_loss/{name}"] = loss.detach()
         return losses
 
@@ -252,7 +236,7 @@ class EntropicActors(Actors[Values]):
         start = math.log(settings.temperature)
         self._log_temperatures = {name: torch.tensor(start, requires_grad=True) for name in spaces}
         self._temperature_adams = {
-            name: adam([log], settings.temperature_rate)
+            name: Adam(log, settings.temperature_rate)
             for name, log in self._log_temperatures.items()
         }
 
@@ -262,20 +246,14 @@ class EntropicActors(Actors[Values]):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that ``load_state_dict`` needs."""
-        temperatures = {
-            name: {"log": log.detach(), "adam": self._temperature_adams[name].state_dict()}
-            for name, log in self._log_temperatures.items()
-        }
+        temperatures = {name: adam.state_dict() for name, adam in self._temperature_adams.items()}
         return super().state_dict() | {"temperatures": temperatures}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """Restore the state that ``state_dict`` returned."""
         super().load_state_dict(values)
-        for name, log in self._log_temperatures.items():
-            of = values["temperatures"][name]
-            with torch.no_grad():
-                log.copy_(torch.as_tensor(of["log"]))
-            self._temperature_adams[name].load_state_dict(of["adam"])
+        for name, adam in self._temperature_adams.items():
+            adam.load_state_dict(values["temperatures"][name])
 
     def _per_agent(self, name: str, entropy: Tensor, situation: Situation) -> Tensor:
         """Return the mean entropy of an agent that acts, from that of all such agents, (N,)."""
@@ -294,10 +272,10 @@ class EntropicActors(Actors[Values]):
 
     def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
         """Update the network and the temperature of a learner, and return values to log."""
-        self._descend(loss, name)
+        self.adams[name].descend(loss)
         log = self._log_temperatures[name]
         excess = log * (entropy - self._target_entropies[name])
-        descend(excess, [log], self._temperature_adams[name], math.inf)
+        self._temperature_adams[name].descend(excess)
         return {
             f"policy_loss/{name}": loss.detach(),
             f"entropy/{name}": entropy,
@@ -318,9 +296,7 @@ class SoftActors(EntropicActors[JointValues]):
         noise = torch.empty_like(scores).exponential_(generator=generator).log_()
         return (scores - noise).argmax(-1)
 
-    def next_values(
-        self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
-    ) -> Tensor:
+    def next_values(self, targets: Tensor, after: Situation, _: torch.Generator) -> Tensor:
         """Return soft values of the target critic, (Z, N).
 
         A soft value is the expected value plus the entropies times the temperatures.
@@ -366,9 +342,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
         """Draw actions from the policies, (N, K)."""
         return self._draw_all(situation, generator)[0]
 
-    def next_values(
-        self, targets: Sequence[Tensor], after: Situation, generator: torch.Generator
-    ) -> Tensor:
+    def next_values(self, targets: Tensor, after: Situation, generator: torch.Generator) -> Tensor:
         """Return the target critic's soft values of actions drawn from the policies, (Z, N)."""
         actions, log_p = self._draw_all(after, generator)
         values = self._least(self._critic.of_actions(after.state, actions, targets))
@@ -407,7 +381,7 @@ class GaussianActors(EntropicActors[ContinuousValues]):
 
         Actions without effect are 0 and do not count in the log-densities.
         """
-        mean, log_std = self.nets[name](situation.observations[name]).chunk(2, dim=-1)
+        mean, log_std = self.nets[name](situation.observations[name])[0].chunk(2, dim=-1)
         log_std = log_std.clamp(LEAST_LOG_STD, MOST_LOG_STD)
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
         actions, log_p = squashed(mean, log_std, noise)
@@ -418,29 +392,6 @@ class GaussianActors(EntropicActors[ContinuousValues]):
             actions = actions.where(acting, 0.0)
             log_p = log_p.where(situation.masks[name].flatten(), 0.0)
         return actions, log_p if len(log_p) == size else log_p.reshape(size, -1).sum(-1)
-
-
-def adam(parameters: Any, rate: float) -> torch.optim.Adam:
-    """Return a fused Adam optimiser (Kingma and Ba 2015), which updates all parameters at once."""
-    return torch.optim.Adam(parameters, rate, fused=True)
-
-
-def descend(
-    loss: Tensor, parameters: Sequence[Tensor], optimiser: torch.optim.Adam, norm: float
-) -> None:
-    """Take a gradient step of the given parameters; no other gradient is computed.
-
-    Args:
-        loss: the loss, shape ().
-        parameters: parameters to update, which are those of ``optimiser``.
-        optimiser: the optimiser.
-        norm: maximum norm of the gradient; ``inf`` for no maximum.
-    """
-    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-        parameter.grad = gradient
-    if norm < math.inf:
-        nn.utils.clip_grad_norm_(parameters, norm)
-    optimiser.step()
 
 
 def _mean_of(values: Tensor, chosen: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ import torch
 
 from sdc_taichi.envs.vector import MultiAgentVectorEnv, vector_env
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.kernels.compiler.runtime import ensure_started
 from sdc_taichi.learning.algorithms import (
     OFF_POLICY,
     ON_POLICY,
@@ -176,6 +177,7 @@ class _Run:
                 self._stream,
                 updates=self._updates,
                 seed=settings.seed,
+                threads=ensure_started(),
             )
         except BaseException:
             env.close()
@@ -417,7 +419,13 @@ class Algorithm(Protocol):
 
 
 def make_algorithm(
-    name: str, settings: LearningSettings, stream: EnvironmentStream, *, updates: int, seed: int
+    name: str,
+    settings: LearningSettings,
+    stream: EnvironmentStream,
+    *,
+    updates: int,
+    seed: int,
+    threads: int = 1,
 ) -> Algorithm:
     """Create an algorithm in its state before the first update.
 
@@ -427,13 +435,16 @@ def make_algorithm(
         stream: the environments to learn in.
         updates: total number of updates of the training.
         seed: seed of all random numbers of the algorithm.
+        threads: maximum number of networks that are updated at the same time.
 
     Raises:
         ConfigError: the algorithm does not support the type of actions, or needs more data centers.
     """
     match settings:
         case OnPolicySettings():
-            return OnPolicy(ON_POLICY[name], settings, stream, updates=updates, seed=seed)
+            return OnPolicy(
+                ON_POLICY[name], settings, stream, updates=updates, seed=seed, threads=threads
+            )
         case OffPolicySettings():
             return OffPolicy(OFF_POLICY[name], settings, stream, updates=updates, seed=seed)
         case CrossEntropySettings():
