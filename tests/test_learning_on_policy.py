@@ -55,10 +55,11 @@ def algorithm(
     *,
     updates: int = 100,
     seed: int = 0,
+    threads: int = 1,
 ) -> Any:
     """An algorithm that takes a game for environments."""
     definition = ON_POLICY[name]
-    return OnPolicy(definition, settings, stream, updates=updates, seed=seed)
+    return OnPolicy(definition, settings, stream, updates=updates, seed=seed, threads=threads)
 
 
 def trained(name: str, game: Game, settings: OnPolicySettings = SMALL, **more: int) -> Any:
@@ -249,6 +250,12 @@ def test_happo_and_mappo_of_one_learner_are_ppo_to_the_bit(discrete: bool) -> No
     ppo = trained("ppo", Rooms(1, discrete), updates=4)
     for name in ("ippo", "mappo", "happo"):
         assert_same_bits(trained(name, Rooms(1, discrete), updates=4), ppo)
+
+
+@pytest.mark.parametrize("name", ["ippo", "happo"])
+def test_threads_change_no_bit(name: str) -> None:
+    one, several = (trained(name, Rooms(3), updates=4, threads=n) for n in (1, 3))
+    assert_same_bits(several, one)
 
 
 def test_mappo_with_critics_of_own_observations_and_rewards_is_ippo_to_the_bit() -> None:

@@ -15,7 +15,7 @@ of each reward.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
@@ -353,11 +353,12 @@ class GaussianActors(EntropicActors[ContinuousValues]):
         drawn = {name: self._draw(name, situation, generator) for name in self.nets}
         actions = torch.cat([part.detach() for part, _ in drawn.values()], dim=1)
         logged: dict[str, Tensor] = {}
+        fixed = self._critic.weights.detach()
         for name in self._order(generator):
             numbers = self.numbers[name]
             part, log_p = drawn[name]
             joint = torch.cat([actions[:, : numbers.start], part, actions[:, numbers.stop :]], 1)
-            values = self._least(self._critic.of_actions(situation.state, joint))
+            values = self._least(self._critic.of_actions(situation.state, joint, fixed))
             value = values[self._reward_of[name]]
             loss = (self.temperature(name) * log_p - value).mean()
             entropy = self._per_agent(name, -log_p.detach(), situation)
