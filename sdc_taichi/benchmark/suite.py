@@ -145,7 +145,8 @@ class Case(Section):
         """Return the values of the case that differ in the short version of a suite."""
         sites = self.sites or SCENARIOS.get(self.scenario or "", {}).get("sites", ())
         years = self.validation_years or self.years
-        test = {"sites": self.test.sites[:_QUICK_PLACES], "years": self.test.years[:1]}
+        years_of_results = self.test.years or self.years
+        test = {"sites": self.test.sites[:_QUICK_PLACES], "years": years_of_results[:1]}
         of_results = {
             "weeks": _spread(self.weeks, _QUICK_PLACES),
             "test": {name: list(x) for name, x in test.items() if x},

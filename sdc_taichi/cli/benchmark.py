@@ -114,8 +114,8 @@ def run_command(
         if not quiet:
             left = [job for job in planned_jobs(chosen) if not store.is_done(job)]
             core_s = sum(map(core_s_of, left))
-            text = f"{len(left):,} jobs, about {duration(core_s)} of processor time, or "
-            text += f"{duration(core_s / session.workers)} in {session.workers} processes"
+            text = f"jobs to run: {len(left):,}, about {duration(core_s)} of processor time, or "
+            text += f"{duration(core_s / session.workers)} with --jobs {session.workers}"
             print(text, file=sys.stderr, flush=True)
         run_suite(chosen, store, session.run)
     if not quiet and session.is_whole:
