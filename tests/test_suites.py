@@ -143,6 +143,10 @@ def test_what_is_not_valid_is_named(changes: Mapping[str, Any], message: str) ->
         ({"rows": {"a": {"train": {"algorithm": "ppo", "seed": 3}}}}, "seed: is that of the case"),
         (case(sites=["Nowhere"]), "cases.tiny"),
         (
+            {"objective": "cost"} | case(sites=[], overrides={"fleet": {"sites": ["AZ", "WA"]}}),
+            "cases.tiny: objective cost; valid for fleets that share work is carbon",
+        ),
+        (
             case(overrides={"events": {"sampled": [{"kind": "grid_outage", "per_year": 9,
                                                     "duration_h": [1, 2]}]}}),
             "optimum true with sampled events",

@@ -49,6 +49,23 @@ def test_agents_observe_prices_where_rewards_depend_on_them() -> None:
         assert ("price_forecast" in dict(made.environment.features or {})["agent_bat"]) == observes
 
 
+def test_halls_are_drawn_for_the_sites_in_turn(tmp_path: Path) -> None:
+    hall: dict[str, Any] = {"algorithm": "ippo", "scenario": "hall", "sites": ["NY", "AZ"]}
+    settings = make_settings({**hall, "halls": {"count": 3, "seed": 1}})
+    drawn = settings.data_centers_of_sites()
+    assert [config.name for config in drawn] == ["hall0-ny", "hall1-az", "hall2-ny"]
+    assert [config.site.location for config in drawn] == ["NY", "AZ", "NY"]
+    assert len({config.hall.model_dump_json() for config in drawn}) == 3
+    assert settings.validation_weeks() == 3 * len(settings.validation.weeks)
+    path = tmp_path / "settings.yaml"
+    path.write_text(settings.to_yaml())
+    assert load_settings(path).data_centers_of_sites() == drawn
+    others = make_settings({**hall, "halls": {"count": 3, "seed": 2}}).data_centers_of_sites()
+    assert all(one.hall != other.hall for one, other in zip(drawn, others, strict=True))
+    with pytest.raises(ConfigError, match="hall family: corrected has no rack type"):
+        make_settings({"algorithm": "ippo", "halls": {"count": 1}}).data_centers_of_sites()
+
+
 def test_agents_of_halls_share_a_policy_unless_set() -> None:
     hall = {"algorithm": "ippo", "scenario": "hall"}
     shared = make_settings(hall)

@@ -19,7 +19,7 @@ from sdc_taichi.learning.training_settings import (
 )
 from sdc_taichi.sim.fleet import build_fleet
 
-_FIXED = ("weeks", "years", "seed", "scenario", "config", "overrides", "sites")
+_FIXED = ("weeks", "years", "seed", "scenario", "config", "overrides", "sites", "halls")
 """Training settings that the case or the seed determines; a row cannot set them."""
 
 
@@ -168,6 +168,10 @@ def check_suite(suite: Suite) -> None:
             data_centers(case, "validation")
         except SdcError as error:
             raise ConfigError(f"{place}: {error}") from None
+        if fleet.shared_work is not None and suite.objective != "carbon":
+            raise ConfigError(
+                f"{place}: objective {suite.objective}; valid for fleets that share work is carbon"
+            )
         if case.optimum and any(config.events.sampled for config in configs):
             raise ConfigError(
                 f"{place}: optimum true with sampled events, which no optimum foresees; valid is "
@@ -203,5 +207,5 @@ def check_suite(suite: Suite) -> None:
 
 def _data_center_values(case: Case) -> dict[str, Any]:
     """Return the values of a case that are also training settings: data centers and options."""
-    names = {"scenario", "config", "overrides", "sites", "environment"}
+    names = {"scenario", "config", "overrides", "sites", "halls", "environment"}
     return case.model_dump(include=names, exclude_defaults=True)

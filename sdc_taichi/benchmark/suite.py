@@ -26,6 +26,7 @@ from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse
 from sdc_taichi.learning.training_settings import (
     MOST_STEPS,
     SCENARIOS,
+    HallDraws,
     Year,
     merged,
     read_values,
@@ -78,6 +79,8 @@ class OtherDataCenters(Section):
     section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, with one data center for each site; an empty list selects those of the training."""
+    halls: HallDraws | None = None
+    """Halls drawn at random; None selects those of the training."""
     years: tuple[Year, ...] = ()
     """Seeds of the synthetic years of each data center; an empty list selects those of the
     training."""
@@ -107,6 +110,9 @@ class Case(Section):
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, with one data center for each site; an empty list selects the sites of the scenario,
     or the site of the configuration."""
+    halls: HallDraws | None = None
+    """Halls drawn at random from the family of the configuration, which have the sites in turn;
+    None selects the hall of the configuration."""
     years: tuple[Year, ...] = ()
     """Seeds of the synthetic years of the training, which pairs of site and week have in turn; an
     empty list selects the year of the configuration."""

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import yaml
 from pydantic import (
     Field,
@@ -48,6 +49,7 @@ from sdc_taichi.learning.split import (
 )
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet_configs import make_configs
+from sdc_taichi.sim.hall_family import hall_family
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 from sdc_taichi.user_functions import check_file_names
 
@@ -228,6 +230,15 @@ class ValidationSettings(Section):
         return _years_once(value)
 
 
+class HallDraws(Section):
+    """Halls drawn at random from the family of the configuration (``sim.hall_family``)."""
+
+    count: Annotated[int, Field(strict=True, ge=1, le=10_000)]
+    """Number of halls, 1..10,000."""
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Seed of the draws, 0..2^31 - 1; other seeds give other halls."""
+
+
 class TrainingSettings(Section):
     """All settings of a training; they determine its result."""
 
@@ -243,6 +254,9 @@ class TrainingSettings(Section):
     """Values that replace those of the configuration, by section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, with one data center for each site; an empty list selects the configuration's site."""
+    halls: HallDraws | None = None
+    """Halls drawn at random, which have the sites in turn, in place of one data center for each
+    site; None selects the hall of the configuration."""
     weeks: Literal["training"] | tuple[Week, ...] | None = "training"
     """Weeks of the year, 0..51, in which episodes begin, with one data center for each site and
     week. ``training`` stands for all weeks that are neither held out nor used for validation. None
@@ -402,7 +416,7 @@ class TrainingSettings(Section):
     def to_yaml(self) -> str:
         """Return the settings as YAML text, from which ``load_settings`` reads equal settings."""
         # Fingerprints of trainings before these settings do not contain them.
-        unset = {name for name in ("own_policies", "years") if not getattr(self, name)}
+        unset = {name for name in ("own_policies", "years", "halls") if not getattr(self, name)}
         values = self.model_dump(mode="json", exclude=unset)
         if not self.validation.years:
             del values["validation"]["years"]
@@ -443,7 +457,8 @@ class TrainingSettings(Section):
     def data_centers_of_sites(self) -> list[DataCenterConfig]:
         """Return one data center for each site; without ``sites``, that of the configuration.
 
-        A configuration of a fleet stands for the data centers of its sites.
+        A configuration of a fleet stands for the data centers of its sites. Halls drawn at random
+        have the sites in turn.
 
         Raises:
             ConfigError: a file, value or site is not valid.
@@ -451,14 +466,28 @@ class TrainingSettings(Section):
         config, tariff = self._config(), self.environment.tariff
         if tariff is not None:
             config = config.model_copy(update={"tariff": tariff})
+        if self.halls is not None:
+            return self._drawn(config, self.halls)
         is_fleet = config.fleet is not None and not self.sites
         return [config] if is_fleet else make_configs(config, sites=self.sites)
+
+    def _drawn(self, config: DataCenterConfig, halls: HallDraws) -> list[DataCenterConfig]:
+        """Return halls drawn from the family of a configuration, named after number and site."""
+        rng = np.random.Generator(np.random.PCG64(halls.seed))
+        sites = make_configs(config, sites=self.sites)
+        drawn = []
+        for at, hall in enumerate(hall_family(rng, halls.count, config)):
+            place = sites[at % len(sites)]
+            name = f"hall{at}-{place.name}"
+            drawn.append(hall.model_copy(update={"name": name, "site": place.site}))
+        return drawn
 
     def validation_weeks(self) -> int:
         """Return the number of validation weeks of all sites together."""
         weeks, years = self.validation.weeks, self.validation.years
         number = len(VALIDATION if weeks == "validation" else weeks)
-        return max(len(self.sites), 1) * max(len(years), 1) * number
+        places = max(len(self.sites), 1) if self.halls is None else self.halls.count
+        return places * max(len(years), 1) * number
 
     def difference(self, other: TrainingSettings) -> str | None:
         """Describe the first setting that differs, ignoring ``steps``; None if all are equal.
