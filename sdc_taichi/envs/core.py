@@ -435,7 +435,11 @@ class Core:
             self._recordings.begin(self.sim)
 
     def step(
-        self, actions: Mapping[str, Any], starting: npt.NDArray[np.bool_] | None = None
+        self,
+        actions: Mapping[str, Any],
+        starting: npt.NDArray[np.bool_] | None = None,
+        *,
+        observes: bool = True,
     ) -> Transition:
         """Advance all environments by one step.
 
@@ -448,6 +452,7 @@ class Core:
                 have a second axis (E, W, ...).
             starting: True for environments of ``restart_ended`` that use this step as the reset of
                 their next episode, (E,): their actions are neutral and their rewards are 0.
+            observes: False leaves out the observations, which ``observe`` then returns if needed.
 
         Raises:
             SdcError: the actions of an agent are missing or outside their space, or there are
@@ -491,7 +496,7 @@ class Core:
         if view.state.step >= self.steps:
             ended_by[~self.ended_early] = EndedBy.LENGTH
         transition = Transition(
-            observations=self._observe(view),
+            observations=self._observe(view) if observes else {},
             rewards=rewards,
             joint_reward=joint_reward,
             costs={n: self._of_env(x) for n, x in self._costs.of(result, view).items()},

@@ -197,13 +197,13 @@ class EnvironmentStream:
         core, by_agent = self._core, self._by_agent(actions)
         # Episodes that ended at a physical limit begin again; the others are not affected.
         core.restart_ended()
-        transition = core.step(by_agent)
+        transition = core.step(by_agent, observes=False)
         by_learner, team = self._rewards(transition)
         for _ in range(self.decision_steps - 1):
             if transition.ended:
                 break
             core.restart_ended()
-            transition = core.step(by_agent)
+            transition = core.step(by_agent, observes=False)
             more, more_of_team = self._rewards(transition)
             by_learner = {name: by_learner[name] + more[name] for name in by_learner}
             team = team + more_of_team
@@ -211,7 +211,7 @@ class EnvironmentStream:
         means = {name: _tensor(self._mean(name, reward)) for name, reward in by_learner.items()}
         for name, reward in means.items():
             self._sums[name] += float(reward.mean())
-        self._take(transition.observations)
+        self._take(core.observe())
         after = StreamStep(
             rewards,
             means,
@@ -315,7 +315,10 @@ class EnvironmentStream:
         """
         core = self._core
         core.reset(seed)
-        return [self._full_rewards(core.step(core.idle_actions())) for _ in range(core.steps)]
+        return [
+            self._full_rewards(core.step(core.idle_actions(), observes=False))
+            for _ in range(core.steps)
+        ]
 
     def _take(self, by_agent: Mapping[str, Observation]) -> None:
         """Set the observations, the masks and the shared state before the next step."""
