@@ -261,7 +261,6 @@ _inputs: dict[str, bytes] = {}
 def _begin_worker(inputs: Inputs, permission: CodePermission | None) -> None:
     """Prepare a worker process: signals, monitoring of the parent, one thread, code, inputs."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _exit)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     compute_in_one_thread()
     set_code_permission(permission)
@@ -270,10 +269,14 @@ def _begin_worker(inputs: Inputs, permission: CodePermission | None) -> None:
 
 def _run_in_worker(job: Job) -> DoneJob:
     """Run a job in a worker process."""
+    signal.signal(signal.SIGTERM, _exit)
     try:
         return run_job(job, _inputs)
     except SystemExit:  # end the process here, as the pool would continue with its next job
         os._exit(1)
+    finally:
+        # Without a job nothing is left to delete, and libraries may be at their own exit.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _exit(*_: Any) -> None:
