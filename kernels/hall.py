@@ -46,7 +46,6 @@ from .hall_arguments import (
     DONE,
     LANES,
     MODE_VECTORS,
-    MOST_CHANGE_K,
     N_BLOCK_TERMS,
     N_TERMS,
     RUNNING,
@@ -96,6 +95,9 @@ from .units import (
 
 END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
 """End of the rows of sums in transient halls, which do not need the sum of the outlets."""
+MOST_LATER_CHANGE_K = 2.0
+"""Change of the air in a substep, in K, up to which substeps become longer after the first of a
+step that begins with the shortest. The abrupt change is then over, so errors remain small."""
 
 
 @ti.func
@@ -114,10 +116,10 @@ def next_length(hall: ti.template(), n, change_k):
     """Return the length of the next substep, from the change of the air in the present one, in K.
 
     It is the longest in which air that goes on to change at this rate changes by at most
-    ``MOST_CHANGE_K``, but at most twice the present length. The last substep is what is left.
+    ``MOST_LATER_CHANGE_K``, but at most twice the present length. The last substep is what is left.
     """
     dc = hall.dcs[n]
-    left, most_k = hall.sweeps - dc.elapsed, ti.cast(MOST_CHANGE_K, ti.f64) * dc.length
+    left, most_k = hall.sweeps - dc.elapsed, ti.cast(MOST_LATER_CHANGE_K, ti.f64) * dc.length
     most = ti.min(ti.min(hall.longest, 2 * dc.length), left)
     length = 1
     while length < most and change_k * (length + 1) <= most_k:

@@ -32,8 +32,6 @@ SPARSE_LANES = 16
 """Source racks in one vector of weights of sparse halls; it serves all lanes of a block."""
 SPARSE_BLOCKS = SPARSE_LANES // LANES
 """Blocks per vector of SPARSE_LANES racks."""
-MOST_CHANGE_K = 0.5
-"""Change of the air of a hall in a substep, in K, above which substeps become shorter."""
 CHUNK_BLOCKS = 16
 """Maximum number of blocks in a chunk; fewer racks do not justify a thread."""
 RANKS_PER_K = 2.0**27
@@ -278,7 +276,7 @@ TERMS = {
 """Sums over the blocks of a chunk, separately for each lane."""
 BLOCK_TERMS = {
     "fresh_m3s": "supply air intake of the servers if units covered all need, m3/s",
-    "plain_m3s": "the same at the exhaust shares of the design point, m3/s (if units exceed)",
+    "plain_m3s": "the same at the exhaust shares of the design point, m3/s",
     "mixed_c": "mean temperature of recirculated air in the substep, C (transient)",
     "parcel_w": "heat that warms the recirculated air in the substep, W (transient)",
 }

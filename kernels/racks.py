@@ -173,8 +173,8 @@ def store_need(
     plain_m3s = fresh_m3s
     if dc.exceeds > 0.0:
         plain_m3s = sums.flow_m3s - block.exhaust_share * (sums.height_m3s * racks.full_m3s)
-        block_terms.plain_m3s = plain_m3s
     block_terms.fresh_m3s = fresh_m3s
+    block_terms.plain_m3s = plain_m3s
     if dc.coupling > 0.0 and dc.follows_need > 0.0:
         need_m3s = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
         for i in range(LANES):

@@ -46,26 +46,30 @@ MOST_PASSES = 100
 @no_type_check
 def sum_unit_needs(hall: ti.template(), n, chunk_at, block_terms_0):
     """Sum the supply air that the racks of a chunk need of each unit, sum_j s_jk (1 - r_j) V_j."""
-    dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
-    n_units = hall.dcs[n + 1].first_unit - dc.first_unit
+    chunk, n_units = hall.chunks[chunk_at], hall.dcs[n + 1].first_unit - hall.dcs[n].first_unit
     n_blocks = hall.chunks[chunk_at + 1].first_block - chunk.first_block
     unit, share_0 = 0, first_share_at(hall, n, chunk.first_block)
     terms_end = block_terms_0 + n_blocks * N_BLOCK_TERMS
     while unit < n_units:
-        need_m3s, terms_at, share_at = hall.zeros, block_terms_0, share_0 + unit
+        # Two units at a time, because their sums do not wait for each other.
+        other = ti.min(unit + 1, n_units - 1)
+        need_m3s, other_need_m3s = hall.zeros, hall.zeros
+        plain_m3s, other_plain_m3s = hall.zeros, hall.zeros
+        terms_at, share_at = block_terms_0, share_0
         while terms_at < terms_end:
-            need_m3s += hall.unit_shares[share_at] * hall.block_terms[terms_at].fresh_m3s
+            terms, share = hall.block_terms[terms_at], hall.unit_shares[share_at + unit]
+            other_share = hall.unit_shares[share_at + other]
+            need_m3s += share * terms.fresh_m3s
+            plain_m3s += share * terms.plain_m3s
+            other_need_m3s += other_share * terms.fresh_m3s
+            other_plain_m3s += other_share * terms.plain_m3s
             terms_at += N_BLOCK_TERMS
             share_at += n_units
         hall.unit_need_m3s[chunk.first_need + unit] = sum_lanes(need_m3s)
-        if dc.exceeds > 0.0:
-            plain_m3s, terms_at, share_at = hall.zeros, block_terms_0, share_0 + unit
-            while terms_at < terms_end:
-                plain_m3s += hall.unit_shares[share_at] * hall.block_terms[terms_at].plain_m3s
-                terms_at += N_BLOCK_TERMS
-                share_at += n_units
-            hall.unit_plain_m3s[chunk.first_need + unit] = sum_lanes(plain_m3s)
-        unit += hall.one
+        hall.unit_plain_m3s[chunk.first_need + unit] = sum_lanes(plain_m3s)
+        hall.unit_need_m3s[chunk.first_need + other] = sum_lanes(other_need_m3s)
+        hall.unit_plain_m3s[chunk.first_need + other] = sum_lanes(other_plain_m3s)
+        unit += 2 * hall.one
 
 
 @ti.func
@@ -75,17 +79,12 @@ def unit_need(hall: ti.template(), n, unit):
 
     The second value is the need at the exhaust shares of the design point.
     """
-    chunk_at, need_m3s = hall.dcs[n].first_chunk, ti.cast(0.0, ti.f64)
+    chunk_at = hall.dcs[n].first_chunk
+    need_m3s, plain_m3s = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     while chunk_at < hall.dcs[n + 1].first_chunk:
         need_m3s += hall.unit_need_m3s[hall.chunks[chunk_at].first_need + unit]
+        plain_m3s += hall.unit_plain_m3s[hall.chunks[chunk_at].first_need + unit]
         chunk_at += hall.one
-    plain_m3s = need_m3s
-    if hall.dcs[n].exceeds > 0.0:
-        plain_m3s = 0.0
-        chunk_at = hall.dcs[n].first_chunk
-        while chunk_at < hall.dcs[n + 1].first_chunk:
-            plain_m3s += hall.unit_plain_m3s[hall.chunks[chunk_at].first_need + unit]
-            chunk_at += hall.one
     return need_m3s, plain_m3s
 
 
@@ -305,6 +304,17 @@ def weigh_units(hall: ti.template(), n, begins: ti.template()):
         of_design = True
     if is_due:
         fit_weights(hall, n, of_design, need_m3s, SUPPLY)
+    change = ti.cast(0.0, ti.f64)
+    if is_due or ti.static(begins):
+        change = set_strengths(hall, n, of_design, begins)
+    return change
+
+
+@ti.func
+@no_type_check
+def set_strengths(hall: ti.template(), n, of_design, begins: ti.template()):
+    """Set the strengths of units to their weights; return the largest relative change."""
+    dc, end_unit = hall.dcs[n], hall.dcs[n + 1].first_unit
     change, weighs = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     at = dc.first_unit
     while at < end_unit:
@@ -420,9 +430,11 @@ def set_present_shares(hall: ti.template(), n, first_chunk, end_chunk):
     """
     dc, unit_0 = hall.dcs[n], hall.dcs[n].first_unit
     n_units = hall.dcs[n + 1].first_unit - unit_0
-    for block_at in range(hall.chunks[first_chunk].first_block, hall.chunks[end_chunk].first_block):
-        share_0, unit = first_share_at(hall, n, block_at), 0
-        if dc.shares_due > 0.0:
+    first_block = hall.chunks[first_chunk].first_block
+    end_block = hall.chunks[end_chunk].first_block
+    if dc.shares_due > 0.0:
+        for block_at in range(first_block, end_block):
+            share_0, unit = first_share_at(hall, n, block_at), 0
             per_total = ti.Vector([ti.cast(1.0, ti.f64)] * LANES)
             if dc.weighs > 0.0:
                 total = ti.Vector([ti.cast(1e-30, ti.f64)] * LANES)  # Padding has no shares.
@@ -439,17 +451,25 @@ def set_present_shares(hall: ti.template(), n, first_chunk, end_chunk):
                     present[i] = ti.cast(share[i], hall.real)
                 hall.unit_shares[share_0 + unit] = present
                 unit += hall.one
-        if dc.exceeds > 0.0:
-            supply_ratio = hall.zeros
-            unit = 0
-            while unit < n_units:
-                ratio = ti.cast(hall.units[unit_0 + unit].supply_ratio, hall.real)
-                supply_ratio += hall.unit_shares[share_0 + unit] * ratio
-                unit += hall.one
-            excess = larger(supply_ratio - hall.real(1.0), hall.zeros)
-            factor = hall.exp_of(excess * ti.cast(-dc.oversupply, hall.real))
+    if dc.exceeds > 0.0:
+        # In a loop of their own, the processor computes exponentials of several blocks at once.
+        block_at, share_at = first_block, first_share_at(hall, n, first_block)
+        while block_at < end_block:
+            supply_ratio, at = hall.zeros, unit_0
+            while at < unit_0 + n_units:
+                ratio = ti.cast(hall.units[at].supply_ratio, hall.real)
+                supply_ratio += hall.unit_shares[share_at] * ratio
+                at += hall.one
+                share_at += hall.one
+            hall.blocks[block_at].present_exhaust_share = supply_ratio
+            block_at += hall.one
+        block_at = first_block
+        while block_at < end_block:
             block = hall.blocks[block_at]
+            excess = larger(block.present_exhaust_share - hall.real(1.0), hall.zeros)
+            factor = hall.exp_of(excess * ti.cast(-dc.oversupply, hall.real))
             block.present_exhaust_share = block.exhaust_share * factor
+            block_at += hall.one
 
 
 @ti.func

@@ -30,7 +30,6 @@ from sdc_taichi.kernels.hall_arguments import (
     LOADS_PER_GROUP,
     LOADS_PER_RACK,
     MODE_VECTORS,
-    MOST_CHANGE_K,
     MOST_SUPPLY_RATIO,
     NOT_CONVERGED,
     OUTLETS,
@@ -163,6 +162,8 @@ SLICES_PER_THREAD = 8
 """Number of work slices per thread; several slices balance the load of the threads."""
 TOLERANCE_K: dict[Precision, float] = {"f32": 2e-4, "f64": 1e-12}
 """Convergence tolerance in K: change of the exhaust mix before any rack by a further sweep."""
+MOST_CHANGE_K = 0.5
+"""Change of the air in a substep, in K, above which a step is repeated with shorter substeps."""
 MOST_LENGTHENED = 4
 """Longest substep of a step with abrupt changes, divided by its shortest substep."""
 SAMPLE_TOLERANCE_K: dict[Precision, float] = {"f32": 5e-5, "f64": 1e-8}
@@ -248,6 +249,8 @@ class HallSums(HallQuantities):
     in K, (B,): the higher of the values at start and end of the step."""
 
 
+_Rows = dict[str, Any]
+"""Values of named rows of the kernel's arrays."""
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
 """Fields of ``HallSums`` that the kernel writes, in the order of its rows."""
 _OUTLET_MAX_ROW = [*RACK_OUT].index("outlet_max_c")
@@ -460,13 +463,14 @@ class Hall:
         self._set_conditions(conditions)
         dc_out = self._new_results()
         self.beyond_limits = None
+        start = self._start_of_step(state, coil)
         before = np.ascontiguousarray(state.server_c, self._dtype)
         after = np.empty(self._fleet.groups, self._dtype)
 
         def advance(
             chosen: npt.NDArray[np.bool_], substeps: int, longest: int, abandoned_above_k: float
         ) -> None:
-            self._set_state(state, coil, chosen)
+            self._write_start(start, chosen)
             self._begin_step(exchanges_before=1, chosen=chosen)
             self._run_sweeps(
                 dc_out,
@@ -738,21 +742,15 @@ class Hall:
                 shares[racks] = tiles.exhaust_share(airflow_m3s) * tiles.of_height
         return shares
 
-    def _set_state(self, state: HallState, coil: Coil, chosen: npt.NDArray[np.bool_]) -> None:
-        """Write the thermal state at the start of a transient step to the kernels.
+    def _start_of_step(self, state: HallState, coil: Coil) -> tuple[_Rows, _Rows, _Rows]:
+        """Return rows of the racks, the CRAC units and the data centers at the start of a step.
 
         Args:
             state: State of the air, and with it the airflow and supply air of the CRAC units.
             coil: Setpoints, heat stored in the room, and limit of the plant.
-            chosen: True for the data centers to set, (B,).
         """
-        fleet, of_unit = self._fleet, chosen[self._fleet.unit_dc]
-        for name in ("mixed_c", "exhaust_c", "captured_m3s"):
-            values = getattr(state, name)
-            if not chosen.all():
-                present = self._places.values_of_racks(self._memory[name][None])[0]
-                values = np.where(chosen[fleet.rack_dc], values, present)
-            self._places.put(self._memory[name], values)
+        fleet = self._fleet
+        of_racks = {name: getattr(state, name) for name in ("mixed_c", "exhaust_c", "captured_m3s")}
         # Shares, and with them the demand on each unit, change when units stop or start.
         need_m3s = state.need_m3s * self._tables.plenum.drawn_ratio
         plain_m3s = state.plain_m3s * self._tables.plenum.drawn_ratio
@@ -771,7 +769,7 @@ class Hall:
         any_running = fleet.unit_sums(running)[fleet.unit_dc] > 0.0
         passes_return_air = (running == 0.0) & any_running
         coil_c = np.where(passes_return_air, state.return_air_c, coil_c)
-        of_units = {
+        of_units: _Rows = {
             "fresh_ratio": np.minimum(1.0, covers),
             "supply_ratio": np.minimum(ratio, MOST_SUPPLY_RATIO),
             "need_m3s": need_m3s,
@@ -784,9 +782,7 @@ class Hall:
             "casing_c": state.casing_c,
         }
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
-        weighs = fleet.unit_sums(np.where(self._unit_state["strength"] != 1.0, 1.0, 0.0)) > 0
-        of_dcs = {
-            "shares_due": weighs,
+        of_dcs: _Rows = {
             "exceeds": exceeds & (fleet.oversupply_decay > 0),
             "fan_speed": state.following[fleet.unit_offsets[:-1]],
             "crac_m3s_per_rack": flow_m3s / np.diff(fleet.rack_offsets),
@@ -801,10 +797,26 @@ class Hall:
             **_water_rows(coil.water),
         }
         self._unit["setpoint_c"][:] = coil.setpoint_c
-        for row, values in of_units.items():
-            np.copyto(self._unit_state[row], values, where=of_unit)
-        for row, values in of_dcs.items():
-            np.copyto(self._dc[row], values, where=chosen)
+        return of_racks, of_units, of_dcs
+
+    def _write_start(
+        self, start: tuple[_Rows, _Rows, _Rows], chosen: npt.NDArray[np.bool_]
+    ) -> None:
+        """Write rows of ``_start_of_step`` for the data centers with ``chosen`` True, (B,)."""
+        of_racks, of_units, of_dcs = start
+        fleet, of_unit = self._fleet, chosen[self._fleet.unit_dc]
+        for name, values in of_racks.items():
+            row = self._memory[name]
+            if not chosen.all():
+                present = self._places.values_of_racks(row[None])[0]
+                values = np.where(chosen[fleet.rack_dc], values, present)
+            self._places.put(row, values)
+        strengths_differ = np.where(self._unit_state["strength"] != 1.0, 1.0, 0.0)
+        shares_due = fleet.unit_sums(strengths_differ) > 0
+        for name, values in of_units.items():
+            np.copyto(self._unit_state[name], values, where=of_unit)
+        for name, values in (of_dcs | {"shares_due": shares_due}).items():
+            np.copyto(self._dc[name], values, where=chosen)
 
     def _begin_steady_step(self, conditions: Conditions) -> None:
         """Set the conditions of a step in steady air, where CRAC units first cover all need."""
