@@ -49,7 +49,7 @@ from sdc_taichi.learning.statistics import (
     probability_of_improvement,
     sample_mean,
 )
-from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.problem import AGENTS, ALL_AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS, title_of
 from sdc_taichi.types import F64
 
@@ -83,7 +83,7 @@ BOARD_TITLES = {
     "parts_pct": "sum of the agents alone (%)",
     "together_pct": "together (%)",
     "worth_points": "coordination (points)",
-    **{agent: f"{agent} alone (%)" for agent in ("load", "cooling", "battery")},
+    **{agent: f"{agent} alone (%)" for agent in ALL_AGENTS},
     **{way: f"{title_of(way)} (%)" for way in WAYS},
     **{f"above_{x:g}_pct": f"above {x:g} % (%)" for x in THRESHOLDS_PCT},
 }
@@ -401,6 +401,7 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
     """Return the savings of each agent alone, with idle others, and of all agents together."""
     import pandas as pd
 
+    agents = [x for x in ALL_AGENTS if x in AGENTS or x in evaluation.alone]
     by_agent = {agent: samples(evaluation, agent) for agent in AGENTS}
     table = []
     for name, (all_together, idle) in figures.items():
@@ -416,7 +417,7 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
         together, parts = float(change_pct(all_together, idle)), sum(changes.values())
         table.append(
             {"row": name}
-            | {agent: changes.get(agent, math.nan) for agent in AGENTS}
+            | {agent: changes.get(agent, math.nan) for agent in agents}
             | {"parts_pct": parts, "together_pct": together, "worth_points": parts - together}
             | {way: float(change_pct(figure, idle)) for way, figure in ways.items()}
         )

@@ -20,6 +20,7 @@ import numpy as np
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, METRICS, MOVES
 from sdc_taichi.learning.split import WEEKS
+from sdc_taichi.optimum.problem import ALL_AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.user_file import decoding, open_parquet, read_parquet
@@ -84,7 +85,7 @@ METRIC_COLUMNS: Mapping[str, Column] = {
 PLACE = ("site", "year", "week")
 """Columns that identify a data-center week."""
 SUITE_COLUMNS: Mapping[str, Column] = {
-    "moves": Column("text", texts=(ALL, *MOVES, *WAYS)),
+    "moves": Column("text", texts=(ALL, *dict.fromkeys((*MOVES, *ALL_AGENTS)), *WAYS)),
     "site": Column("text"),
     "year": Column("whole number"),
     "week": Column("whole number", high=WEEKS - 1),

@@ -31,7 +31,7 @@ from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation, strata_of
 from sdc_taichi.learning.training_settings import MOST_STEPS
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.problem import ALL_AGENTS
 from sdc_taichi.optimum.uncoordinated import WAYS
 
 if TYPE_CHECKING:
@@ -283,7 +283,7 @@ def evaluation_of(case: CaseResults) -> Evaluation:
     return Evaluation(
         rows=rows,
         objective=case.objective,
-        alone={moves: x for moves, x in beside.items() if moves in AGENTS},
+        alone={moves: x for moves, x in beside.items() if moves in ALL_AGENTS},
         uncoordinated={moves: x for moves, x in beside.items() if moves in WAYS},
         strata=strata_of(first["site"], first["year"]),
         missing=(),
