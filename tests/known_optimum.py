@@ -59,7 +59,7 @@ def made_up_optimum(
         load=np.zeros(shape),
         cooling=cooling,
         battery=battery,
-        loops=None,
+        loops=np.full((*shape, 3), np.nan),
         bound_of_ends=bound_of_ends,
     )
 

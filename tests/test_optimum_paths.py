@@ -146,7 +146,10 @@ def test_battery_paths_keep_below_a_peak_where_they_can() -> None:
 
 def neutral(steps: int, size: int, setpoint_c: float) -> Targets:
     nothing = np.full((steps, size), np.nan)
-    return Targets(nothing, np.full((steps, size), setpoint_c), nothing, np.ones((steps, size)))
+    held = np.full((steps, size, 3), np.nan)
+    return Targets(
+        nothing, np.full((steps, size), setpoint_c), nothing, np.ones((steps, size)), held
+    )
 
 
 def run(fleet: Fleet, drivers: Drivers, targets: Targets, start: I64) -> RollOut:
@@ -176,6 +179,7 @@ def test_targets_are_reached_as_far_as_models_allow() -> None:
         setpoint_c=np.array([[20.0, 22.0, 22.5, 21.0, 19.0, 18.0]]).T,
         stored_kwh=np.array([[0.02, 0.03, 0.03, 0.01, 0.005, 0.01]]).T,
         facility_kwh=np.ones((6, 1)),
+        loops=np.full((6, 1, 3), np.nan),
     )
     done = run(fleet, drivers, targets, start)
     np.testing.assert_allclose(done.queue_tasks, targets.queue_tasks, atol=1e-9)

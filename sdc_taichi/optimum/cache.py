@@ -25,7 +25,7 @@ from sdc_taichi.sim import snapshot
 from sdc_taichi.types import F64
 
 _X = TypeVar("_X")
-METHOD = 4
+METHOD = 5
 """Version of the solution method. Cached files of other versions are not used."""
 _MOST_FIGURE = 1e15
 """Largest figure of a cached optimum."""
@@ -90,7 +90,7 @@ class Entry:
     """Battery commands of the best plan, (T,)."""
     loops: F64
     """Commands of the coolant loops in the best plan, (T, 3): supply setpoint in C, flow as a share
-    of design, and approach in K; (0, 3) if it holds the loops."""
+    of design, and approach in K; nan holds the loops."""
     uncoordinated: Mapping[str, float] = field(default_factory=dict)
     """Figures of plans that agents make without coordination, by the names of
     ``uncoordinated.uncoordinated``; empty if they were not simulated."""
@@ -262,8 +262,7 @@ def _from_arrays(arrays: Mapping[str, Any], key: str, steps: int, agents: Sequen
     }
     for name, most in (("load", 1.0), ("cooling", _MOST_FIGURE), ("battery", 1.0)):
         values[name] = _numbers(arrays, name, (steps,), -most, most)
-    moved = steps if np.size(arrays["loops"]) else 0
-    values["loops"] = _numbers(arrays, "loops", (moved, 3), 0.0, _MOST_FIGURE)
+    values["loops"] = _numbers(arrays, "loops", (steps, 3), 0.0, _MOST_FIGURE, or_nan=True)
     entry = Entry(
         **values,
         bound=_numbers(arrays, "bound", (), -_MOST_FIGURE, _MOST_FIGURE, or_nan=True).item(),

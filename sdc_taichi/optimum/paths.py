@@ -124,15 +124,15 @@ def targets_of(problem: Problem, plans: Mapping[Agent, F64]) -> Targets:
     nothing = np.full(problem.steps, np.nan)
     queue = _queue_tasks(problem, plans["load"]) if "load" in plans else nothing
     stored = plans.get("battery", nothing)
-    loops = known.table.loops
-    if loops is not None:
-        loops = in_range(at_utilisation(loops, known.table.utilisation, utilisation).T).T[:, None]
+    loops, of_table = np.full((problem.steps, 3), np.nan), known.table.loops
+    if of_table is not None:
+        loops = in_range(at_utilisation(of_table, known.table.utilisation, utilisation).T).T
     return Targets(
         queue_tasks=queue[:, None],
         setpoint_c=known.idle_setpoint_c[:, None],
         stored_kwh=stored[:, None],
         facility_kwh=facility[:, None],
-        loops=loops,
+        loops=loops[:, None],
     )
 
 

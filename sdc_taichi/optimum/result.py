@@ -71,9 +71,9 @@ class Optimum:
     """Cooling commands of the best plan, in steps of the setpoint, (T, B)."""
     battery: F64
     """Battery commands of the best plan, (T, B)."""
-    loops: F64 | None
+    loops: F64
     """Commands of the coolant loops in the best plan, (T, B, 3): supply setpoint in C, flow as a
-    share of design, and approach in K; nan, or None for all data centers, holds the loops."""
+    share of design, and approach in K; nan holds the loops."""
     bound_of_ends: Callable[[int, Ends], float]
     """Function that returns the bound of a data center, by its index, for given start and end
     states; nan if there is no bound."""

@@ -57,9 +57,9 @@ class Targets:
     """Energy stored after each step, in kWh, (T, B); nan means an idle battery."""
     facility_kwh: F64
     """Expected energy of the facility in each step, in kWh, (T, B)."""
-    loops: F64 | None = None
+    loops: F64
     """Commands of the coolant loops in each step, (T, B, 3): supply setpoint in C, flow as a share
-    of design, and approach in K. nan, or None for all, means held loops."""
+    of design, and approach in K; nan means held loops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +183,7 @@ class Follower:
         )
         self._step_k = v("hvac.setpoint.step_k")[fleet.unit_dc]
         self._unit_dc = fleet.unit_dc
+        self._loops = LoopFollower(fleet, targets.loops)
 
     def actions(self, state: State) -> Actions:
         """Return the commands of the coming step.
@@ -194,7 +195,7 @@ class Follower:
             load=self._load(state),
             cooling=self._cooling(state),
             battery=self._battery_command(state),
-            **loop_commands(self._targets.loops, state, self._fleet),
+            **self._loops.commands(state),
         )
 
     def loops_lag_k(self, state: State) -> F64:
@@ -204,10 +205,9 @@ class Follower:
             state: State after a step.
         """
         lag_k = np.zeros(self._fleet.size)
-        if self._targets.loops is not None:
-            target_c = self._targets.loops[state.step - 1, self._fleet.cdu_dc, 0]
-            apart_k = np.abs(state.cdu_setpoint_c - target_c)
-            np.maximum.at(lag_k, self._fleet.cdu_dc, np.nan_to_num(apart_k))
+        target_c = self._targets.loops[state.step - 1, self._fleet.cdu_dc, 0]
+        apart_k = np.abs(state.cdu_setpoint_c - target_c)
+        np.maximum.at(lag_k, self._fleet.cdu_dc, np.nan_to_num(apart_k))
         return lag_k
 
     def _load(self, state: State) -> F64:
@@ -246,25 +246,35 @@ class Follower:
         )
 
 
-def loop_commands(loops: F64 | None, state: State, fleet: Fleet) -> dict[str, F64]:
-    """Return the commands of the coolant loops in the coming step, by field of ``Actions``.
+class LoopFollower:
+    """Computes the commands of coolant loops from their values in each step.
 
     Args:
-        loops: Commands of each step, (T, B, 3), as in ``Targets``; nan holds the loops.
-        state: State before the step.
         fleet: B data centers.
+        loops: Commands of each step, (T, B, 3), as in ``Targets``; nan holds the loops.
     """
-    if loops is None:
-        return {}
-    sections = [config.liquid for config in fleet.configs]
-    approach_k = np.array(
-        [APPROACH_LIMITS_K[0] if s is None else s.cdus.approach_k for s in sections]
-    )
-    setpoint_c, flow, wanted_k = loops[state.step].T
-    held = state.cdu_setpoint_c, state.cdu_flow, approach_k
-    wanted = setpoint_c[fleet.cdu_dc], flow[fleet.cdu_dc], wanted_k
-    values = (np.where(np.isnan(x), hold, x) for x, hold in zip(wanted, held, strict=True))
-    return dict(zip(LOOP_COMMANDS, values, strict=True))
+
+    def __init__(self, fleet: Fleet, loops: F64) -> None:
+        self._cdu_dc, self._wanted = fleet.cdu_dc, loops
+        self._moves = not np.isnan(loops).all()
+        sections = [config.liquid for config in fleet.configs]
+        self._held_approach_k = np.array(
+            [APPROACH_LIMITS_K[0] if s is None else s.cdus.approach_k for s in sections]
+        )
+
+    def commands(self, state: State) -> dict[str, F64]:
+        """Return the commands of the coming step by field of ``Actions``; empty if all hold.
+
+        Args:
+            state: State before the step.
+        """
+        if not self._moves:
+            return {}
+        setpoint_c, flow, wanted_k = self._wanted[state.step].T
+        held = state.cdu_setpoint_c, state.cdu_flow, self._held_approach_k
+        wanted = setpoint_c[self._cdu_dc], flow[self._cdu_dc], wanted_k
+        values = (np.where(np.isnan(x), hold, x) for x, hold in zip(wanted, held, strict=True))
+        return dict(zip(LOOP_COMMANDS, values, strict=True))
 
 
 def load_command(

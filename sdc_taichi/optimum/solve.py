@@ -213,17 +213,9 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
         load=paths("load"),
         cooling=paths("cooling"),
         battery=paths("battery"),
-        loops=_loops(task, entries),
+        loops=np.stack([entry.loops for entry in entries], axis=1),
         bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries], cache),
     )
-
-
-def _loops(task: Task, entries: Sequence[Entry]) -> F64 | None:
-    """Return the commands of the coolant loops in the best plans, (T, B, 3); None if all hold."""
-    if not any(len(entry.loops) for entry in entries):
-        return None
-    held = np.full((task.steps, 3), np.nan)
-    return np.stack([entry.loops if len(entry.loops) else held for entry in entries], axis=1)
 
 
 def _players(agents: Sequence[Agent]) -> tuple[Agent, ...]:
@@ -310,7 +302,7 @@ class _Case:
             load=done.load_command[:, 0],
             cooling=done.cooling_command[:, 0],
             battery=done.battery_command[:, 0],
-            loops=np.empty((0, 3)) if loops is None else np.ascontiguousarray(loops[:, 0]),
+            loops=np.ascontiguousarray(loops[:, 0]),
             uncoordinated={
                 way: self._valued_figure(certificate) for way, certificate in uncoordinated.items()
             },
@@ -342,7 +334,7 @@ class _Case:
 
     def problem_of(self, path: Targets) -> Problem:
         """Return the problem with the tables of a path, which moves the coolant loops or not."""
-        return self.problem if path.loops is not None else self.problem.moving(())
+        return self.problem.moving(()) if np.isnan(path.loops).all() else self.problem
 
     def missing_kwh(self, name: str) -> float:
         """Return the stored energy that a simulated plan lacks at its end, in kWh; 0 without it."""
@@ -384,15 +376,12 @@ def _of_case(plans: Mapping[Agent, _Plans], i: int) -> dict[Agent, F64]:
 
 def _beside(paths: Sequence[Targets]) -> Targets:
     """Return the paths of n data centers, each with B = 1, as those of one batch with B = n."""
-    joined = {
-        f.name: np.concatenate([getattr(path, f.name) for path in paths], axis=1)
-        for f in fields(Targets)
-        if f.name != "loops"
-    }
-    held = np.full((*joined["setpoint_c"][:, :1].shape, 3), np.nan)
-    loops = [held if path.loops is None else path.loops for path in paths]
-    moved = any(path.loops is not None for path in paths)
-    return Targets(**joined, loops=np.concatenate(loops, axis=1) if moved else None)
+    return Targets(
+        **{
+            f.name: np.concatenate([getattr(path, f.name) for path in paths], axis=1)
+            for f in fields(Targets)
+        }
+    )
 
 
 def _unreachable_limit(best: Certificate) -> tuple[str, ...]:

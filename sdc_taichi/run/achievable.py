@@ -19,7 +19,7 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.optimum.fleet import FleetOptimum, FleetScore
 from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.rollout import LEAST_K, broken_constraints, loop_commands
+from sdc_taichi.optimum.rollout import LEAST_K, LoopFollower, broken_constraints
 from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import finite_or_none
@@ -39,6 +39,7 @@ class AchievedPath:
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum = optimum
+        self._loops: LoopFollower | None = None
 
     def reset(self, seed: int | I64) -> None:
         """Do nothing, because the controller has no state."""
@@ -48,11 +49,13 @@ class AchievedPath:
         step, of = view.state.step, self._optimum
         if step >= of.steps:
             raise SdcError(f"step {step} of an optimum of {of.steps} steps")
+        if self._loops is None:
+            self._loops = LoopFollower(view.fleet, of.loops)
         return Actions(
             load=of.load[step],
             cooling=of.cooling[step],
             battery=of.battery[step],
-            **loop_commands(of.loops, view.state, view.fleet),
+            **self._loops.commands(view.state),
         )
 
 
