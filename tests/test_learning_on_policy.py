@@ -44,6 +44,7 @@ SMALL = OnPolicySettings(
     discount=0.9,
     anneal=False,
 )
+TEAM = SMALL.model_copy(update={"reward": "team"})
 QUICK = SMALL.model_copy(update={"rate": 0.05, "epochs": 3, "mini_batches": 1})
 """Settings that learn simple games in few updates."""
 
@@ -263,7 +264,8 @@ def test_mappo_with_critics_of_own_observations_and_rewards_is_ippo_to_the_bit()
     ippo = trained("ippo", Rooms(3), updates=4)
     assert_same_bits(trained("mappo", Rooms(3), apart, updates=4), ippo)
     learned = np.concatenate([w.ravel() for w in weights(ippo)])
-    other = np.concatenate([w.ravel() for w in weights(trained("mappo", Rooms(3), updates=4))])
+    mappo = trained("mappo", Rooms(3), TEAM, updates=4)
+    other = np.concatenate([w.ravel() for w in weights(mappo)])
     assert not np.array_equal(learned, other)
 
 
@@ -273,7 +275,7 @@ def test_advantages_are_weighed_by_the_ratios_of_learners_before(
     game = Rooms(3)
     # HAPPO is alike but for clipping, and learns from rows in an order that is not known here.
     assert ON_POLICY["happo"]._replace(clips=False) == ON_POLICY["haa2c"]
-    algo = algorithm("haa2c", game)
+    algo = algorithm("haa2c", game, TEAM)
     algo.update(game)
     weighed: list[Tensor] = []
     rows: list[tuple[Tensor, dict[str, Tensor]]] = []

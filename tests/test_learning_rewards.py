@@ -13,7 +13,13 @@ import sdc_taichi  # noqa: E402
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.envs.agents import AGENTS  # noqa: E402
 from sdc_taichi.envs.core import Core  # noqa: E402
-from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings  # noqa: E402
+from sdc_taichi.learning.algorithms import (  # noqa: E402
+    OFF_POLICY,
+    ON_POLICY,
+    OffPolicySettings,
+    OnPolicySettings,
+)
+from sdc_taichi.learning.off_policy import OffPolicy  # noqa: E402
 from sdc_taichi.learning.on_policy import OnPolicy  # noqa: E402
 from sdc_taichi.learning.policy import action_levels  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream  # noqa: E402
@@ -82,3 +88,14 @@ def test_agents_trained_for_a_moment_beat_idle_ones(rewards: str) -> None:
     # Work is in time, and inlets are at most 0.3 K above 27 C in the mean.
     assert found["sla"] > -1.0
     assert found["hot_inlets"] > idle["hot_inlets"] - 0.3 * 16 * 192
+
+
+@pytest.mark.usefixtures("one_torch_thread")
+def test_policies_keep_exploring_though_random_choices_cost_much_on_the_bill() -> None:
+    settings = OffPolicySettings(hidden=(32,), gradient_steps=32, batch_size=512)
+    stream = EnvironmentStream(env_of(64, "bill"), decision_steps=4, levels=settings.levels, seed=0)
+    learner = OffPolicy(OFF_POLICY["hasac"], settings, stream, updates=20, seed=0)
+    for _ in range(20):
+        logged = learner.update(stream)
+    # The target is 0.48 nats. With transitions of four decisions that of the battery falls to 0.06.
+    assert all(logged[f"entropy/{agent}"] > 0.3 for agent in AGENTS), logged

@@ -32,7 +32,8 @@ class LearningSettings(BaseModel):
     reward: Reward | None = None
     """Reward that learners learn from: ``own``, the reward of each learner; ``team``, the mean
     reward of all learning agents; or a mixture of both, as the share of the own reward, 0..1. None
-    selects the default of the algorithm."""
+    selects the default: that of the algorithm, but ``team`` if agents share a policy and critics
+    take the shared state, which cannot distinguish such agents."""
 
     def steps_per_update(self, episode_steps: int) -> int:
         """Return the number of steps of each data center between two updates.
@@ -59,12 +60,13 @@ class ActingSettings(LearningSettings):
 
 
 class OnPolicySettings(ActingSettings):
-    """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
+    """Settings of ``ppo``, ``ippo``, ``mappo`` and ``happo``."""
 
     epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
-    """Number of passes (epochs) over the collected steps in each update; ``haa2c`` makes one."""
+    """Number of passes (epochs) over the collected steps in each update (not ``haa2c``)."""
     mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
-    """Number of mini-batches that the collected steps of an update are divided into."""
+    """Number of mini-batches that the collected steps of an update are divided into (not
+    ``haa2c``)."""
     rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
@@ -74,7 +76,7 @@ class OnPolicySettings(ActingSettings):
     gae_lambda: Share = 0.95
     """Parameter lambda of generalised advantage estimation (Schulman et al. 2016)."""
     clip: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Clipping range epsilon of the probability ratio; ``haa2c`` does not clip."""
+    """Clipping range epsilon of the probability ratio (not ``haa2c``)."""
     entropy: Annotated[float, Field(ge=0, le=10)] = 0.001
     """Weight of the policies' entropy in the objective."""
     gradient_norm: Annotated[float, Field(gt=0)] = 0.5
@@ -86,6 +88,14 @@ class OnPolicySettings(ActingSettings):
     critic: Literal["observation", "state"] | None = None
     """Input of critics: the observation of their learner, or the shared state; None selects the
     one in the publication of the algorithm."""
+
+
+class OnePassSettings(OnPolicySettings):
+    """Settings of ``haa2c``, which makes one gradient step in each update."""
+
+    rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
+    """Number of decisions of each data center between two updates; small, because each update makes
+    only one gradient step."""
 
 
 class OffPolicySettings(ActingSettings):
@@ -106,8 +116,9 @@ class OffPolicySettings(ActingSettings):
     """Capacity of the replay buffer: number of decisions, summed over all data centers. Each
     decision takes four bytes for every entry of the shared state and of the observations, which
     is 250 MB in total by default."""
-    n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
-    """Number n of decisions that an n-step transition spans."""
+    n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
+    """Number n of decisions that an n-step transition spans. More than one decision values a choice
+    by the later choices of older policies, such as random ones, which are not corrected for."""
     rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
@@ -187,9 +198,9 @@ class OffPolicyDefinition(NamedTuple):
 ON_POLICY: dict[str, OnPolicyDefinition] = {
     "ppo": OnPolicyDefinition(critic="observation", reward="team", sequential=False, clips=True),
     "ippo": OnPolicyDefinition(critic="observation", reward="own", sequential=False, clips=True),
-    "mappo": OnPolicyDefinition(critic="state", reward="team", sequential=False, clips=True),
-    "happo": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=True),
-    "haa2c": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=False),
+    "mappo": OnPolicyDefinition(critic="state", reward="own", sequential=False, clips=True),
+    "happo": OnPolicyDefinition(critic="state", reward="own", sequential=True, clips=True),
+    "haa2c": OnPolicyDefinition(critic="state", reward="own", sequential=True, clips=False),
 }
 """On-policy algorithms, which learn from the steps of their current policies, by name."""
 OFF_POLICY: dict[str, OffPolicyDefinition] = {
@@ -199,23 +210,26 @@ OFF_POLICY: dict[str, OffPolicyDefinition] = {
 """Off-policy algorithms, which learn from the steps in a replay buffer, by name."""
 LEARNING_SETTINGS: dict[str, type[LearningSettings]] = {
     **dict.fromkeys(ON_POLICY, OnPolicySettings),
+    "haa2c": OnePassSettings,
     **dict.fromkeys(OFF_POLICY, OffPolicySettings),
     "cross-entropy": CrossEntropySettings,
 }
 """Class of the settings of each algorithm, by name."""
 
 
-def own_share(reward: Reward | None, default: Reward) -> float:
+def own_share(reward: Reward | None, default: Reward, *, shared_policy: bool = False) -> float:
     """Return the share of the own reward in the reward that learners learn from, 0..1.
 
     Args:
         reward: setting ``reward``.
-        default: reward that None selects.
+        default: default reward of the algorithm.
+        shared_policy: True if agents that critics cannot distinguish share a policy.
     """
-    chosen = default if reward is None else reward
-    if isinstance(chosen, str):
-        return 1.0 if chosen == "own" else 0.0
-    return chosen
+    if reward is None:
+        reward = "team" if shared_policy else default
+    if isinstance(reward, str):
+        return 1.0 if reward == "own" else 0.0
+    return reward
 
 
 def gradient_steps(name: str, settings: LearningSettings, updates: int) -> int:

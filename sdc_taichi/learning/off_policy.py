@@ -98,7 +98,11 @@ class OffPolicy:
         self._columns = _columns(self._spaces, stream.state_width)
         self._numbers = _numbers(self._spaces)
         self._soft = definition.soft
-        self._own_share = own_share(settings.reward, definition.reward)
+        self._own_share = own_share(
+            settings.reward,
+            definition.reward,
+            shared_policy=any(of.count > 1 for of in self._spaces.values()),
+        )
         rewards = len(self._spaces) if self._own_share else 1
         self._critic, self._actors = _critic_and_actors(
             definition,

@@ -11,12 +11,16 @@ clipping:
 
 - ``ppo`` (Schulman et al. 2017) has one learner, and ``ippo`` (de Witt et al. 2020) has several.
   Each learner has a critic, which takes its observation and learns its reward. M_i is 1.
-- ``mappo`` (Yu et al. 2022) has one critic, which takes the shared state and learns the reward of
-  the team. M_i is 1. With own rewards each learner has a critic of the shared state.
-- ``happo`` (Kuba et al. 2022; Zhong et al. 2024) has the critic of ``mappo``. Learners are updated
+- ``mappo`` (Yu et al. 2022) has a critic for each learner, which takes the shared state and learns
+  the reward of the learner. M_i is 1.
+- ``happo`` (Kuba et al. 2022; Zhong et al. 2024) has the critics of ``mappo``. Learners are updated
   one after another in random order, and M_i is the product of the ratios r_j of the learners j that
   are already updated.
 - ``haa2c`` (Zhong et al. 2024) is ``happo`` without clipping, with a single pass over the steps.
+
+In the publications of the last three, one critic learns the reward of the team, as here with
+setting ``reward=team``. The proof that no update of ``happo`` makes the team worse holds for that
+reward alone.
 
 Each agent of a group that shares a policy is a row of one learner. A critic that takes the shared
 state therefore has the same value for all agents of a group. In M_i, the ratio of such a learner is
@@ -123,7 +127,12 @@ class OnPolicy:
         self._settings, self._spaces, self._updates = settings, stream.spaces, updates
         self._threads = threads
         self._definition = definition._replace(critic=settings.critic or definition.critic)
-        self._own_share = own_share(settings.reward, definition.reward)
+        self._own_share = own_share(
+            settings.reward,
+            definition.reward,
+            shared_policy=self._definition.critic == "state"
+            and any(of.count > 1 for of in self._spaces.values()),
+        )
         self._done = 0
         self._generators = generators(seed)
         self._actors: dict[str, Actor] = {}
