@@ -352,7 +352,8 @@ class Suite(Section):
             return values
         filled = dict(cases)
         for name, case in cases.items():
-            other = cases.get(case.get("trained_in")) if isinstance(case, Mapping) else None
+            trained_in = case.get("trained_in") if isinstance(case, Mapping) else None
+            other = cases.get(trained_in) if isinstance(trained_in, str) else None
             if isinstance(other, Mapping):
                 base = {k: v for k, v in other.items() if k not in ("about", "rows")}
                 filled[name] = merged(base, case)
