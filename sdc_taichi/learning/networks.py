@@ -210,8 +210,7 @@ class Perceptrons:
             weights: weights to use in place of the attribute, such as those of a target network.
         """
         used = self.weights if weights is None else weights
-        out: Tensor = _Outputs.apply(inputs.expand(self._number, -1, -1), used, self)
-        return out
+        return self.run(inputs.expand(self._number, -1, -1), used)[-1]
 
     def layers(self, weights: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return views of weights: weight, (E, in, out), and bias, (E, 1, out), of each layer.
@@ -238,25 +237,15 @@ class Perceptrons:
             values.append(torch.baddbmm(bias, values[i], weight))
         return values
 
-    def gradient(
-        self,
-        values: Sequence[Tensor],
-        of_out: Tensor,
-        weights: Tensor | None = None,
-        of_inputs: Tensor | None = None,
-    ) -> Tensor:
+    def gradient(self, values: Sequence[Tensor], of_out: Tensor) -> Tensor:
         """Return the gradient of the weights; that of further parameters is 0.
 
         Args:
             values: inputs of each layer, as ``run`` returned them.
             of_out: gradient of the outputs, (E, N, out).
-            weights: weights to use in place of the attribute.
-            of_inputs: tensor that receives the gradient of the inputs, (E, N, width); None if that
-                gradient is not needed.
         """
         gradient = torch.zeros_like(self._flat)
-        layers = self._layers if weights is None else self.layers(weights)
-        parts = list(zip(layers, self.layers(gradient), values, strict=False))
+        parts = list(zip(self._layers, self.layers(gradient), values, strict=False))
         for i, ((weight, _), (of_weight, of_bias), inputs) in reversed(list(enumerate(parts))):
             torch.bmm(inputs.transpose(1, 2), of_out, out=of_weight)
             torch.sum(of_out, 1, keepdim=True, out=of_bias)
@@ -266,30 +255,11 @@ class Perceptrons:
                     _TANH_BACKWARD(of_out, inputs, grad_input=of_out)
                 else:
                     _RELU_BACKWARD(of_out, inputs, 0, grad_input=of_out)
-            elif of_inputs is not None:
-                torch.bmm(of_out, weight.transpose(1, 2), out=of_inputs)
         return gradient
 
 
 _TANH_BACKWARD = torch.ops.aten.tanh_backward.grad_input
 _RELU_BACKWARD = torch.ops.aten.threshold_backward.grad_input
-
-
-class _Outputs(torch.autograd.Function):
-    """Outputs of perceptrons for automatic differentiation."""
-
-    @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weights: Tensor, net: Perceptrons) -> Tensor:
-        *values, out = net.run(inputs, weights)
-        ctx.net = net
-        ctx.save_for_backward(weights, *values)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
-        weights, *values = ctx.saved_tensors
-        of_inputs = torch.empty_like(values[0]) if ctx.needs_input_grad[0] else None
-        return of_inputs, ctx.net.gradient(values, gradients[0], weights, of_inputs), None
 
 
 def layers_of(net: Perceptrons) -> tuple[tuple[F32, F32], ...]:
