@@ -52,18 +52,15 @@ def print_fleet_optimum(
     from sdc_taichi.optimum.problem import StoppedError
     from sdc_taichi.run.loop import simulate
 
-    def check() -> None:
-        if stop():
-            raise StoppedError("nothing is kept")
-
-    best = solve_fleet(sim, steps=steps, check=check)
+    best = solve_fleet(sim, steps=steps, stop=stop)
     reached = {}
     for name, controller in named.items():
         with progress_bar(steps, shown=not quiet) as advance:
             totals = simulate(
                 sim, controller, steps, seed, forecast_error=error, on_step=advance, stop=stop
             )
-        check()
+        if stop():
+            raise StoppedError("nothing is kept")
         sums = totals.sums
         reached[name] = emissions_g(sim, sums["carbon_g"], sums["transfer_g"], steps)
     if as_json:

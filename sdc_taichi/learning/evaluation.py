@@ -39,7 +39,6 @@ from sdc_taichi.learning.statistics import change_pct, share_pct
 from sdc_taichi.learning.training_folder import SETTINGS_FILE, settings_of
 from sdc_taichi.learning.training_settings import TrainingSettings
 from sdc_taichi.optimum import StoppedError
-from sdc_taichi.optimum.cache import cache_in
 from sdc_taichi.optimum.fleet import FleetOptimum, FleetScore, solve_fleet
 from sdc_taichi.optimum.objective import CARBON, Objective, Score
 from sdc_taichi.optimum.problem import AGENTS
@@ -246,7 +245,7 @@ def prepare(
             if aim != CARBON:
                 raise ConfigError(f"objective {aim}: valid for fleets that share work is carbon")
             if optimum:
-                best = solve_fleet(sim, steps=steps, check=_check(stop), cache=cache_in(cache))
+                best = solve_fleet(sim, steps=steps, cache=cache, stop=stop or (lambda: False))
         elif optimum:
             best = solve(
                 sim.fleet,
@@ -518,16 +517,6 @@ def _run(
         stop=stop,
     )
     return score, done.steps == weeks.steps
-
-
-def _check(stop: Callable[[], bool] | None) -> Callable[[], None]:
-    """Return a function that raises ``StoppedError`` if ``stop`` returns true."""
-
-    def check() -> None:
-        if stop is not None and stop():
-            raise StoppedError("nothing is kept")
-
-    return check
 
 
 def _achievement(best: Optimum | FleetOptimum, score: Score) -> Achievement:

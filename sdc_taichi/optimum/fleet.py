@@ -15,6 +15,7 @@ hours.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -22,13 +23,14 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, whole_number
-from sdc_taichi.optimum.cache import Cache, key_of
+from sdc_taichi.optimum.cache import cache_in, key_of
 from sdc_taichi.optimum.objective import CARBON, Objective, Score
 from sdc_taichi.optimum.paths import cheapest_setpoints_c
 from sdc_taichi.optimum.problem import (
     RAMP_K,
     FlexibleWork,
     Problem,
+    StoppedError,
     no_table_reasons,
     problems_of,
 )
@@ -375,20 +377,27 @@ def solve_fleet(
     sim: Simulator,
     *,
     steps: int,
-    check: Callable[[], None] = lambda: None,
-    cache: Cache | None = None,
+    cache: bool | str | os.PathLike[str] = False,
+    stop: Callable[[], bool] = lambda: False,
 ) -> FleetOptimum:
     """Compute the least carbon that fleets can emit if all inputs are known.
 
     Args:
         sim: Simulator of F fleets; it is reset.
         steps: Number of steps, T, from the start of its drivers.
-        check: Called before every programme; an error that it raises ends the work.
-        cache: Cache with an entry for each fleet; None neither reads nor writes one.
+        cache: Whether to read and write an entry for each fleet in the user's cache, or the folder
+            to use instead.
+        stop: Called before every programme; the work ends when it returns True.
 
     Raises:
         ConfigError: The data centers share no work, or no plan satisfies the limits.
+        StoppedError: ``stop`` returned True.
     """
+
+    def check() -> None:
+        if stop():
+            raise StoppedError("nothing is kept")
+
     fleet, shared = sim.fleet, sim.fleet.shared_work
     if shared is None:
         raise ConfigError("optimum of a fleet: the data centers share no work")
@@ -401,9 +410,10 @@ def solve_fleet(
         raise ConfigError(f"optimum of a fleet: no bound, since {reasons[0]}")
     sim.reset()
     drivers, sizing, sites = sim.drivers, sim.sizing, fleet.sites_per_fleet
-    keys = [] if cache is None else _keys(sim, steps)
-    if cache is not None:
-        known = (cache.find_figures(key, _FIGURES) for key in keys)
+    used_cache = cache_in(cache)
+    keys = [] if used_cache is None else _keys(sim, steps)
+    if used_cache is not None:
+        known = (used_cache.find_figures(key, _FIGURES) for key in keys)
         entries = [entry for entry in known if entry is not None]
         if len(entries) == len(keys):
             return FleetOptimum(steps, **{x: np.array([e[x] for e in entries]) for x in _FIGURES})
@@ -479,8 +489,8 @@ def solve_fleet(
         overdue_tasks=score.overdue_of_fleets,
     )
     for at, key in enumerate(keys):
-        assert cache is not None  # Without a cache there are no keys.
-        cache.keep_figures(key, {name: getattr(optimum, name)[at] for name in _FIGURES})
+        assert used_cache is not None  # Without a cache there are no keys.
+        used_cache.keep_figures(key, {name: getattr(optimum, name)[at] for name in _FIGURES})
     return optimum
 
 
