@@ -196,9 +196,7 @@ def check_reference(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows
     Raises:
         SdcError: a metric is missing or of another type, or there are rows.
     """
-    validated(_SolvedMetrics, metrics, METRICS_FILE)
-    if rows:
-        raise ConfigError(f"{ROWS_FILE}: valid is a job of optima without rows")
+    _check_without_rows(_SolvedMetrics, metrics, rows)
 
 
 def check_trial(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
@@ -211,9 +209,14 @@ def check_trial(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: by
     Raises:
         SdcError: a metric is missing or of another type, or there are rows.
     """
-    validated(TrialMetrics, metrics, METRICS_FILE)
+    _check_without_rows(TrialMetrics, metrics, rows)
+
+
+def _check_without_rows(kind: type[Record], metrics: Mapping[str, Any], rows: bytes) -> None:
+    """Check the metrics of a job whose result has no table rows."""
+    validated(kind, metrics, METRICS_FILE)
     if rows:
-        raise ConfigError(f"{ROWS_FILE}: valid is a trial without rows")
+        raise ConfigError(f"{ROWS_FILE}: valid is a result without rows")
 
 
 def check_row(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:

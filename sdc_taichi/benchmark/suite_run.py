@@ -115,14 +115,38 @@ def _references(suite: Suite, name: str, part: Part) -> list[Job]:
             "objective": suite.objective,
             **files,
         }
-        partition = {
-            "suite": suite.name,
-            "case": name,
-            "row": f"{REFERENCE}-{part}-{config.name}" + ("" if year is None else f"-{year}"),
-            "seed": "0",
-        }
+        row = f"{REFERENCE}-{part}-{config.name}" + ("" if year is None else f"-{year}")
+        partition = _partition(suite, name, row, 0)
         jobs.append(Job(f"{_FUNCTIONS}:solve_reference", values, partition, check=check_reference))
     return jobs
+
+
+def _solved(suite: Suite, name: str, part: Part, references: Sequence[Job]) -> dict[str, str]:
+    """Return the inputs with the optima of a part of a case: keys of jobs by their names."""
+    names = {job.key: job.name for job in references}
+    return {names[x.key]: x.key for x in _references(suite, name, part) if x.key in names}
+
+
+def _of_case(suite: Suite, name: str) -> dict[str, Any]:
+    """Return the values of the jobs of a case that are equal for all rows, trials and seeds."""
+    case = suite.cases[name]
+    values = case.model_dump(mode="json", exclude={"about", "rows"})
+    return {"case": values, "objective": suite.objective, **_files(case)}
+
+
+def _of_row(suite: Suite, label: str, row: Row, seed: int) -> dict[str, Any]:
+    """Return the values of a job that trains or runs a row, beside those of its case."""
+    return {
+        "name": label,
+        "row": row.model_dump(mode="json", exclude=_NOT_OF_ROWS),
+        "training": suite.training if row.train is not None else {},
+        "seed": seed,
+    }
+
+
+def _partition(suite: Suite, case: str, row: str, seed: int) -> dict[str, str]:
+    """Return the partition of the result of a job."""
+    return {"suite": suite.name, "case": case, "row": row, "seed": str(seed)}
 
 
 def trial_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
@@ -135,37 +159,24 @@ def trial_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         references: finished jobs that computed the optima of the suite.
     """
     jobs: list[Job] = []
-    tuning, names = suite.tuning, {job.key: job.name for job in references}
+    tuning = suite.tuning
     if tuning is None:
         return jobs
     for name, case in suite.cases.items():
         if case.trained_in is not None:
             continue
-        solved = [x for x in _references(suite, name, "validation") if x.key in names]
+        inputs, of_case = _solved(suite, name, "validation", references), _of_case(suite, name)
         learners: dict[str, dict[str, Any]] = {}
         for label, row in suite.rows.items():
             if suite.is_for(label, name) and row.train is not None:
                 learners.setdefault(row.train["algorithm"], row.train)
         for algorithm in (x for x in tuning.space if x in learners):
+            label = f"{TRIAL}-{algorithm}"
             for trial in range(tuning.trials):
                 changes = {"steps": tuning.steps, "learning": tuning.learning(algorithm, trial)}
-                train = merged(learners[algorithm], changes)
-                values = {
-                    "name": f"{TRIAL}-{algorithm}",
-                    "case": case.model_dump(mode="json", exclude={"about", "rows"}),
-                    "row": Row(train=train).model_dump(mode="json", exclude=_NOT_OF_ROWS),
-                    "training": suite.training,
-                    "objective": suite.objective,
-                    "seed": _SEED_OF_TRIALS,
-                    **_files(case),
-                }
-                partition = {
-                    "suite": suite.name,
-                    "case": name,
-                    "row": f"{TRIAL}-{algorithm}",
-                    "seed": str(trial),
-                }
-                inputs = {names[x.key]: x.key for x in solved}
+                row = Row(train=merged(learners[algorithm], changes))
+                values = of_case | _of_row(suite, label, row, _SEED_OF_TRIALS)
+                partition = _partition(suite, name, label, trial)
                 jobs.append(Job(f"{_FUNCTIONS}:run_trial", values, partition, inputs, check_trial))
     return jobs
 
@@ -179,15 +190,12 @@ def row_jobs(suite: Suite, references: Sequence[Job], trials: Sequence[Job] = ()
         trials: finished jobs that tried settings of trainings.
     """
     jobs: list[Job] = []
-    names = {job.key: job.name for job in references}
-    files = {name: _files(case) for name, case in suite.cases.items()}
     solved = {
-        (name, part): {
-            names[x.key]: x.key for x in _references(suite, name, part) if x.key in names
-        }
+        (name, part): _solved(suite, name, part, references)
         for name in suite.cases
         for part in _parts_needed(suite, name)
     }
+    of_cases = {name: _of_case(suite, name) for name in suite.cases}
     made: dict[tuple[str, str], list[Job]] = {}
     # Cases in which policies are trained come before those that take them.
     cases = sorted(suite.cases.items(), key=lambda pair: pair[1].trained_in is not None)
@@ -199,18 +207,10 @@ def row_jobs(suite: Suite, references: Sequence[Job], trials: Sequence[Job] = ()
             optima = {k: v for part in parts for k, v in solved[name, part].items()}
             for seed in range(number_of_seeds(suite, name, label)):
                 inputs = dict(optima)
-                values = {
-                    "name": label,
-                    "case": case.model_dump(mode="json", exclude={"about", "rows"}),
-                    "row": row.model_dump(mode="json", exclude=_NOT_OF_ROWS),
-                    "training": suite.training if row.train is not None else {},
-                    "objective": suite.objective,
-                    "seed": seed,
-                    **files[name],
-                }
+                values = of_cases[name] | _of_row(suite, label, row, seed)
                 if policies:
                     values["policies"] = policies
-                partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
+                partition = _partition(suite, name, label, seed)
                 if case.trained_in is not None and row.chooses:
                     # With one seed there, it is that of all seeds here.
                     made_there = made[case.trained_in, label]
