@@ -125,6 +125,7 @@ def test_another_input_file_in_a_place_makes_other_jobs(tmp_path: Path) -> None:
         (case(rows=["idel"]), "cases.tiny.rows: no row 'idel'"),
         (case(forecast_error="ci=x"), "forecast_error"),
         (case(weeks=[1]), "week 1 stands in weeks too, by which nothing may be chosen"),
+        (case(test={"years": [6, 6]}), "test.years: [6, 6]; valid is each year once"),
         (case(config="tinny"), "no such file or preset; did you mean 'tiny'"),
         (case(optimum=False), "rows.optimum: case tiny has optimum false"),
     ],

@@ -34,12 +34,28 @@ def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
     Raises:
         ConfigError: a file, value or site is not valid.
     """
+    return _settings_of_data_centers(case, part).data_centers_of_sites()
+
+
+def number_of_weeks(case: Case, part: Part) -> int:
+    """Return the number of weeks of a part of a case, summed over its data centers and years.
+
+    Args:
+        case: the case.
+        part: ``held-out`` or ``validation``.
+    """
+    places = _settings_of_data_centers(case, part).places
+    return places * max(len(years_of(case, part)), 1) * len(weeks_of(case, part))
+
+
+def _settings_of_data_centers(case: Case, part: Part) -> TrainingSettings:
+    """Return settings of a training that has the data centers of a part of a case."""
     values = _data_center_values(case)
     if part == "held-out":
         changes = case.test.model_dump(exclude={"years"}, exclude_defaults=True)
         values = merged(values, changes)
     # The settings require an algorithm, which does not affect the data centers.
-    return make_settings({"algorithm": "ippo"} | values, "case").data_centers_of_sites()
+    return make_settings({"algorithm": "ippo"} | values, "case")
 
 
 def weeks_of(case: Case, part: Part) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sdc_taichi.benchmark.cases import data_centers, training_settings, weeks_of, years_of
+from sdc_taichi.benchmark.cases import number_of_weeks, training_settings, weeks_of
 from sdc_taichi.benchmark.jobs import Job
 from sdc_taichi.benchmark.suite import TRIAL, Case, Part, Row
 from sdc_taichi.envs.agents import AGENTS
@@ -44,12 +44,12 @@ def core_s_of(job: Job) -> float:
     run_s = START_S
     if not values["name"].startswith(TRIAL):
         per_day_s = PLAN_S_PER_DAY if "mpc" in str(row.controller) else RUN_S_PER_DAY
-        run_s += per_day_s * _days(case, "held-out")
+        run_s += per_day_s * number_of_weeks(case, "held-out") * case.days
     if "made_by" in values:
         return run_s
     if row.best_of is not None:
         tried = RULES if row.best_of == "rules" else len(row.best_of)
-        return run_s + tried * RUN_S_PER_DAY * _days(case, "validation")
+        return run_s + tried * RUN_S_PER_DAY * number_of_weeks(case, "validation") * case.days
     if row.train is not None:
         settings = training_settings(
             case, row, objective=values["objective"], seed=0, training=values["training"]
@@ -70,9 +70,3 @@ def _training_s(settings: TrainingSettings) -> float:
         days = settings.validation_weeks() * settings.validation.days
         seconds += RUN_S_PER_DAY * days * (settings.steps // every)
     return seconds
-
-
-def _days(case: Case, part: Part) -> int:
-    """Return the number of days of a part of a case, summed over its data centers."""
-    years = max(len(years_of(case, part)), 1)
-    return len(data_centers(case, part)) * years * len(weeks_of(case, part)) * case.days

@@ -27,7 +27,7 @@ from sdc_taichi.learning.training_settings import (
     MOST_STEPS,
     SCENARIOS,
     HallDraws,
-    Year,
+    Years,
     merged,
     read_values,
 )
@@ -81,7 +81,7 @@ class OtherDataCenters(Section):
     """Sites, with one data center for each site; an empty list selects those of the training."""
     halls: HallDraws | None = None
     """Halls drawn at random; None selects those of the training."""
-    years: tuple[Year, ...] = ()
+    years: Years = ()
     """Seeds of the synthetic years of each data center; an empty list selects those of the
     training."""
 
@@ -113,10 +113,10 @@ class Case(Section):
     halls: HallDraws | None = None
     """Halls drawn at random from the family of the configuration, which have the sites in turn;
     None selects the hall of the configuration."""
-    years: tuple[Year, ...] = ()
+    years: Years = ()
     """Seeds of the synthetic years of the training, which pairs of site and week have in turn; an
     empty list selects the year of the configuration."""
-    validation_years: tuple[Year, ...] = ()
+    validation_years: Years = ()
     """Seeds of the synthetic years of each data center in the validation weeks; an empty list
     selects those of the training."""
     environment: dict[str, Any] = Field(default={})

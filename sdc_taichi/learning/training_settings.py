@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import yaml
 from pydantic import (
+    AfterValidator,
     Field,
     SerializeAsAny,
     field_serializer,
@@ -190,8 +191,19 @@ MOST_STEPS = 10**12
 """Maximum number of steps of a training; even the fastest machine would take years for it."""
 Week = Annotated[int, Field(strict=True, ge=0, lt=WEEKS)]
 """Week of the year, 0..51."""
-Year = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
-"""Seed of a synthetic year, 0..2^31 - 1."""
+
+
+def _years_once(value: tuple[int, ...]) -> tuple[int, ...]:
+    """Check that a tuple of years has no duplicates; return it."""
+    if len(set(value)) < len(value):
+        raise ValueError(f"{list(value)}; valid is each year once")
+    return value
+
+
+Years = Annotated[
+    tuple[Annotated[int, Field(strict=True, ge=0, lt=2**31)], ...], AfterValidator(_years_once)
+]
+"""Seeds of synthetic years, 0..2^31 - 1, each once."""
 _FIXED_BY_WEEKS = ("start", "months")
 
 Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
@@ -206,7 +218,7 @@ class ValidationSettings(Section):
     validation."""
     weeks: Literal["validation"] | tuple[Week, ...] = "validation"
     """Weeks of the year, 0..51; ``validation`` stands for weeks 5, 18, 31 and 44."""
-    years: tuple[Year, ...] = ()
+    years: Years = ()
     """Seeds of the synthetic years of each data center; an empty list selects that of the
     configuration."""
     days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
@@ -223,11 +235,6 @@ class ValidationSettings(Section):
     @classmethod
     def _each_week_once(cls, value: Any) -> Any:
         return _weeks_once(value)
-
-    @field_validator("years")
-    @classmethod
-    def _each_year_once(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        return _years_once(value)
 
 
 class HallDraws(Section):
@@ -261,7 +268,7 @@ class TrainingSettings(Section):
     """Weeks of the year, 0..51, in which episodes begin, with one data center for each site and
     week. ``training`` stands for all weeks that are neither held out nor used for validation. None
     takes the first days of episodes from ``environment``."""
-    years: tuple[Year, ...] = ()
+    years: Years = ()
     """Seeds of synthetic years. Each pair of site and week is in one of them, the pairs in turn. An
     empty list selects the year of the configuration."""
     data_centers: Annotated[int, Field(strict=True, ge=1, le=1_000_000)] | None = None
@@ -341,10 +348,10 @@ class TrainingSettings(Section):
 
     @field_validator("years")
     @classmethod
-    def _each_year_once(cls, value: tuple[int, ...], info: Any) -> Any:
+    def _years_have_weeks(cls, value: tuple[int, ...], info: Any) -> tuple[int, ...]:
         if value and info.data.get("weeks", ()) is None:
             raise ValueError("without effect with weeks null; valid is environment.years")
-        return _years_once(value)
+        return value
 
     @field_validator("learning", mode="before")
     @classmethod
@@ -482,12 +489,16 @@ class TrainingSettings(Section):
             drawn.append(hall.model_copy(update={"name": name, "site": place.site}))
         return drawn
 
+    @property
+    def places(self) -> int:
+        """Number of data centers, or of fleets that share work, not counting weeks and years."""
+        return max(len(self.sites), 1) if self.halls is None else self.halls.count
+
     def validation_weeks(self) -> int:
         """Return the number of validation weeks of all sites together."""
         weeks, years = self.validation.weeks, self.validation.years
         number = len(VALIDATION if weeks == "validation" else weeks)
-        places = max(len(self.sites), 1) if self.halls is None else self.halls.count
-        return places * max(len(years), 1) * number
+        return self.places * max(len(years), 1) * number
 
     def difference(self, other: TrainingSettings) -> str | None:
         """Describe the first setting that differs, ignoring ``steps``; None if all are equal.
@@ -559,13 +570,6 @@ def read_values(path: str | os.PathLike[str], *, allow_code: bool = False) -> di
         )
     check_file_names(values, path, is_path=is_path, allow_code=allow_code)
     return values
-
-
-def _years_once(value: tuple[int, ...]) -> tuple[int, ...]:
-    """Check that a tuple of years has no duplicates; return it."""
-    if len(set(value)) < len(value):
-        raise ValueError(f"{list(value)}; valid is each year once")
-    return value
 
 
 def _weeks_once(value: Any) -> Any:
