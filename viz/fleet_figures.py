@@ -444,8 +444,11 @@ def curve_plot(
             axes.fill_between(points[column], points["low"], points["high"], alpha=0.15,
                               linewidth=0.0, color=style.get("color"))  # fmt: skip
         axes.set(xlabel=title)
+        style_axes(axes)
     panels[0].set(ylabel=label)
-    style_axes_with_legend(panels[-1])
+    # A legend of one panel would take its width from the others.
+    names = panels[0].get_legend_handles_labels()
+    figure.legend(*names, loc="outside upper left", ncols=7, fontsize=9, frameon=False)
     return figure
 
 
