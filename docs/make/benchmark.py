@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 BOARD_COLUMNS = ("change_pct", "share_pct", "tripped_rack_h")
 PAPER_COLUMNS = ("cfp_kg", "printed_cfp_kg", "against_constant")
 """Columns of the table on the page, which has a line for the rows of one place or one table."""
-CELL_ROWS = ("idle", "best-constant", "rules", "baselines", "ippo")
+CELL_ROWS = ("idle", "best-constant", "rules", "rules-best", "baselines", "ippo")
 """Rows of the cells, as far as a case has them."""
 PLANNED = {"small": "mpc-24h", "carbon": "mpc-24h"}
 """Row of plans in the cells of a suite; in other suites it would take too long to test."""
