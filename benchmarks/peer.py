@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.types import ServerLayers
 
 # Threads that wait must not look like threads that work.

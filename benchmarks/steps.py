@@ -13,7 +13,8 @@ from sdc_taichi.control import view_maker
 from sdc_taichi.kernels.compiler.launch import BoundKernel
 from sdc_taichi.plant.liquid import LiquidFleet
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs
 from sdc_taichi.types import I32, StepResult
 

@@ -19,7 +19,8 @@ from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums, Precision
 from sdc_taichi.types import F64
 
 SEEDS = st.integers(0, 2**32 - 1)

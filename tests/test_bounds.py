@@ -42,7 +42,7 @@ from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
 from sdc_taichi.sim.fleet import build_fleet
-from sdc_taichi.sim.hall_solver import Conditions
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.sim.physical_limits import LIMITS
 from simulated import assert_same, part_of
 

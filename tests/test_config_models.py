@@ -21,7 +21,7 @@ from sdc_taichi.plant import chiller
 from sdc_taichi.plant.chiller import ChillerModel, ChillerPoint, ChillerResult
 from sdc_taichi.sim import sizing
 from sdc_taichi.sim.events import Places, schedule
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import Values
 
 REGISTRIES: dict[str, tuple[str, Collection[str]]] = {

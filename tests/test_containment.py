@@ -14,7 +14,8 @@ from sdc_taichi import ConfigError, DataCenterConfig, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums
 from sdc_taichi.sim.step_inputs import UnitIndex
 from sdc_taichi.types import F64
 

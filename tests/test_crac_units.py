@@ -20,7 +20,8 @@ from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.sim.step_inputs import UnitIndex
 from sdc_taichi.types import CoolAction

@@ -27,7 +27,8 @@ from sdc_taichi import (
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import chiller, tower, water
 from sdc_taichi.sim import stages
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.types import F64
 

@@ -33,7 +33,7 @@ from sdc_taichi.envs import released
 from sdc_taichi.envs.released import FEATURES, ReleasedObserver, ReleasedRewards
 from sdc_taichi.errors import DataError
 from sdc_taichi.sim.drivers import FleetSeries
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import F64, I64, StepResult
 from test_reference import BATTERY, COOLING, FOLDERS, LOAD, TRAJECTORIES, rack_config
 

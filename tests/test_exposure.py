@@ -13,7 +13,8 @@ from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
 from sdc_taichi.hall.exposure import exposure, with_lack
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.layout_solver.solve import solve_at_design_point
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.types import F64
 
 ALIKE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[130, 10]"]

@@ -23,7 +23,8 @@ from sdc_taichi.exogenous import standard_pressure_pa
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet_configs import locations
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 
 TINY = load_config("tiny")
 

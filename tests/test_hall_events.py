@@ -22,7 +22,7 @@ from sdc_taichi.config import apply_overrides
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
 from sdc_taichi.run.metrics import add_step, empty_totals, metrics_of_fleet, metrics_per_dc
 from sdc_taichi.sim.events import seeds_of_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 from simulated import actions_of, assert_same, part_of, random_actions, run

@@ -21,7 +21,8 @@ from random_halls import fleet_of
 from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Hall
+from sdc_taichi.sim.hall_state import Coil, Conditions, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
 # Data centers of any make-up move odd amounts of air.

@@ -23,7 +23,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.exogenous import site_names
 from sdc_taichi.run.metrics import metrics_of_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 

@@ -13,7 +13,8 @@ from random_halls import assert_close, at_design
 from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.recirculation import calibrate
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.types import F64
 
 SMALL_HALL = [

@@ -49,7 +49,8 @@ from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.hall.steady_modes import extended_modes
 from sdc_taichi.kernels.arguments import row_index
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
-from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
 # --- against the twin ---------------------------------------------------------------------------

@@ -42,7 +42,8 @@ from sdc_taichi.hall.mix_weights import layout_weights
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.plant import chiller, cooling, tower, water, workload
 from sdc_taichi.sim.drivers import FleetSeries
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums, Precision
 from sdc_taichi.sim.sizing import released_ranges
 from sdc_taichi.types import F64, WaterQuantities
 from work_steps import work_step

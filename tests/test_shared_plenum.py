@@ -14,7 +14,8 @@ from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import row_index
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums
 from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64
 

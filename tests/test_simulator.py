@@ -29,7 +29,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import F64
 from simulated import actions_of, assert_same, part_of, random_actions, run, short_drivers
 

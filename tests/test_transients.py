@@ -38,15 +38,8 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import (
-    ChilledWater,
-    Coil,
-    Conditions,
-    Hall,
-    HallState,
-    HallSums,
-    Precision,
-)
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import ChilledWater, Coil, Conditions, HallState, HallSums, Precision
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 

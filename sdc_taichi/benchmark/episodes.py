@@ -40,7 +40,7 @@ from sdc_taichi.optimum.rollout import Follower, Targets
 from sdc_taichi.optimum.solve import solve
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath
 from sdc_taichi.run.loop import simulate
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, StepResult
 

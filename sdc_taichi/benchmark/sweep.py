@@ -55,7 +55,7 @@ from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Metric, empty_totals, metrics_per_dc
 from sdc_taichi.sim.fleet import build_fleet, shared_values
 from sdc_taichi.sim.fleet_configs import locations, names_of_runs, place_names
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from sdc_taichi.plant.battery import round_trip_efficiency
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.zone_loads import RackLoads, ZoneLoads

@@ -30,7 +30,7 @@ from sdc_taichi.envs.options import (
 )
 from sdc_taichi.envs.recording import RecorderOption
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import F32, F64
 from sdc_taichi.user_functions import import_path
 

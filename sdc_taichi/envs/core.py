@@ -66,7 +66,7 @@ from sdc_taichi.sim.drivers import local_start, utc_start
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.fleet_configs import MOST_DCS, with_sites
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.step_inputs import LIQUID_COMMANDS
 from sdc_taichi.types import (

@@ -29,7 +29,8 @@ from sdc_taichi.errors import DataError
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Hall, Precision
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.sizing import Sizing, released_ranges
 from sdc_taichi.types import F32, F64, I64, StepResult
 

@@ -56,7 +56,7 @@ from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import add_step, empty_totals, metrics_per_dc
 from sdc_taichi.sim.bills import no_demand
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, Actions, StepResult
 

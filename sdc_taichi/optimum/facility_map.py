@@ -27,7 +27,7 @@ from sdc_taichi.optimum.tables import (
 from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import F64, I64
 
 MARGIN_K = 5.0

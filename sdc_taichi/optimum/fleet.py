@@ -43,7 +43,7 @@ from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.shared_work import SharedWork
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing

@@ -29,7 +29,7 @@ from sdc_taichi.plant.workload import RELEASED_QUEUE_TASKS, TASKS_PER_STEP, arri
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import (

@@ -64,7 +64,7 @@ from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.types import F64, I64
 
 _LEAST_ENERGY_ERROR = 1e-6

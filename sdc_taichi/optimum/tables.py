@@ -15,7 +15,7 @@ from sdc_taichi.optimum.loop_map import LoopCommands
 from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.stages import SteadyFacility
 from sdc_taichi.types import F64, I64
 

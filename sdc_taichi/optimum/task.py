@@ -24,7 +24,7 @@ from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.hall_state import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.types import I64

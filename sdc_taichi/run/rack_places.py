@@ -20,7 +20,8 @@ from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c, rank
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
 from sdc_taichi.sim.drivers import load_drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions
 from sdc_taichi.sim.sizing import size
 from sdc_taichi.types import F64
 

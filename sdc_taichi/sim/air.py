@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from sdc_taichi.sim.crac_units import Supply, UnitAir
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import ChilledWater, Coil, Conditions, Hall, HallState, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import ChilledWater, Coil, Conditions, HallState, HallSums
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.step_inputs import Surroundings, UnitIndex
 from sdc_taichi.sim.work_allocation import Placement

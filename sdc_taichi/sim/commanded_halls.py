@@ -14,7 +14,7 @@ from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.fleet import build_fleet
-from sdc_taichi.sim.hall_solver import Conditions, Precision
+from sdc_taichi.sim.hall_state import Conditions, Precision
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.stages import make_stages, without_memory
 from sdc_taichi.sim.step_inputs import Surroundings

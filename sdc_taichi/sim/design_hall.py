@@ -18,7 +18,8 @@ from sdc_taichi.sim.design_liquid import (
     solve_design_liquid,
 )
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums
 from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64
 

@@ -32,7 +32,7 @@ from sdc_taichi.plant.water_side import (
 )
 from sdc_taichi.sim.crac_units import Supply, UnitAir
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
-from sdc_taichi.sim.hall_solver import HallSums
+from sdc_taichi.sim.hall_state import HallSums
 from sdc_taichi.sim.physical_limits import within_limits
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
 from sdc_taichi.sim.step_inputs import Commands, Surroundings

@@ -13,7 +13,8 @@ from sdc_taichi.config.odd_values import odd_w_class, warn_of
 from sdc_taichi.hall.protection import TRIPPED
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Hall, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import HallSums
 from sdc_taichi.sim.junction_parts import JunctionParts, junction_parts
 from sdc_taichi.sim.liquid import Liquid, LiquidInputs, LiquidResult, LiquidState
 from sdc_taichi.sim.room_dew_point import RoomDewPoint

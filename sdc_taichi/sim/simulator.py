@@ -21,7 +21,7 @@ from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers, utc_start
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import HallSums, Precision
+from sdc_taichi.sim.hall_state import HallSums, Precision
 from sdc_taichi.sim.inlet_parts import IntakeAir
 from sdc_taichi.sim.junction_parts import NO_JUNCTIONS, JunctionParts
 from sdc_taichi.sim.liquid_halls import LiquidStep, no_liquid_state, with_leaks, without_liquid

@@ -18,7 +18,8 @@ from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.plant.tower import TOWERS, TowerDesignPoint, design_water_kg_s
 from sdc_taichi.plant.water_side import WaterSideDesign, hydraulic_pump_w
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import Conditions, HallSums
 from sdc_taichi.sim.liquid_fleet import liquid_design
 from sdc_taichi.types import F64, fields_of
 

@@ -17,7 +17,8 @@ from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.facility import Facility, FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import Hall
+from sdc_taichi.sim.hall_state import HallSums, Precision
 from sdc_taichi.sim.liquid_halls import LiquidHalls, LiquidStep, no_liquid_state
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.sizing import Sizing, size

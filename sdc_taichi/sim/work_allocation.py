@@ -14,7 +14,7 @@ from sdc_taichi.hall.placement import make_bins, place
 from sdc_taichi.hall.protection import THROTTLED, TRIPPED, Mask
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import HallSums
+from sdc_taichi.sim.hall_state import HallSums
 from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import F64, I64, RackQuantities, State, Status
