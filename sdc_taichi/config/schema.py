@@ -6,6 +6,7 @@ Field names include their units. An unknown key is an error that suggests the ne
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -573,10 +574,7 @@ class DataCenterConfig(Section):
 
     def _listed_groups(self) -> tuple[tuple[ServerGroup, ...], ...] | None:
         """Return the server groups of every rack, or one entry for all racks, or None."""
-        types = self.hall.rack_types
-        return (
-            tuple(types[n].air_servers for n in self.hall.rack_type_names()) or self.servers.groups
-        )
+        return _groups_of_types(self.hall) or self.servers.groups
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Return the server groups of every rack, with counts scaled to ``hall.capacity_mw``.
@@ -626,6 +624,13 @@ class DataCenterConfig(Section):
             return text
         # Escape control characters, which could otherwise affect a terminal that shows the text.
         return yaml.safe_dump(values, sort_keys=False)
+
+
+@lru_cache(maxsize=64)
+def _groups_of_types(hall: HallConfig) -> tuple[tuple[ServerGroup, ...], ...]:
+    """Return the server groups of the type of every rack, (R,); empty without ``rack_types``."""
+    types = hall.rack_types
+    return tuple(types[name].air_servers for name in hall.rack_type_names())
 
 
 def _check_rack(where: str, rack: tuple[ServerGroup, ...]) -> None:
