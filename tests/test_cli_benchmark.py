@@ -42,7 +42,7 @@ def test_a_suite_is_run_and_goes_on_with_what_is_missing(file: Path, tmp_path: P
     options = [str(file), "--out", str(out), "--rows"]
     first = call(*options, "idle")
     assert (first.exit_code, first.stderr.count("\n")) == (0, 2), first.stderr
-    assert first.stderr.startswith("jobs to run: 1, about 0:02 of processor time, or 0:02 with")
+    assert first.stderr.startswith("jobs to run: 1, about 0:01 of processor time, or 0:01 with")
     assert f"benchmark report {out}" in first.stdout
     refused = call(*options, "idle,coldest")
     assert refused.exit_code == 2
