@@ -133,7 +133,8 @@ def section(
     for at, picture in enumerate(case_pictures(board)[: 1 if board.curves.empty else 2]):
         path = f"img/benchmark-{suite.name}{'-curves' * at}.webp"
         write(docs / path, webp(drawn(picture.draw(), 80)))
-        parts.append(f"![{picture.alt.partition(':')[0]}: suite {suite.name}]({path})")
+        alt = picture.alt.partition(":")[0].rstrip(".")
+        parts.append(f"![{alt}: suite {suite.name}]({path})")
         caption = picture.caption.replace("picture", f"picture of case {board.case.name}", 1)
         end = f"{literal_markdown(caption)} {end}"
     parts.append(end)
