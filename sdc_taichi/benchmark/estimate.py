@@ -5,7 +5,6 @@ The times are measured on one core of an AMD EPYC with the suites of the package
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
@@ -26,18 +25,18 @@ PLAN_S_PER_DAY = 0.2
 RULES = 60
 """Number of controllers that the search for the best rules tries."""
 ALL_STEP_S = 1.2e-3
-"""Processor time of a step of a training in addition to that of its data centers, in s."""
+"""Processor time that a step of a training takes for any number of data centers, in s."""
 GRADIENT_STEP_S = 0.02
 """Processor time of a gradient step from a replay buffer, in s."""
 
 
 class _Pace(NamedTuple):
-    """Processor time of one data center of a case."""
+    """Processor time that one data center takes, by the kind of its hall."""
 
     run_s_per_day: float
-    """Of a controller that does not plan, in s per day."""
+    """Processor time of a controller that does not plan, in s per simulated day."""
     training_step_s: float
-    """Of a training with the gradient steps of on-policy algorithms, in s per step."""
+    """Processor time of a training step, with the gradient steps of on-policy algorithms, in s."""
 
 
 _QUASI_STEADY, _LIQUID, _TRANSIENT = _Pace(0.002, 4e-5), _Pace(0.004, 1.8e-4), _Pace(0.1, 7.5e-4)
@@ -45,7 +44,7 @@ _QUASI_STEADY, _LIQUID, _TRANSIENT = _Pace(0.002, 4e-5), _Pace(0.004, 1.8e-4), _
 
 @lru_cache(maxsize=64)
 def _pace_of(case_text: str) -> _Pace:
-    """Return the processor time of the first data center of a case, given as JSON."""
+    """Return the processor times of the first data center of a case, which is given as JSON."""
     config = data_centers(Case.model_validate_json(case_text), "held-out")[0]
     if config.simulation.thermal == "transient":
         return _TRANSIENT
@@ -60,7 +59,7 @@ def core_s_of(job: Job) -> float:
     """
     values = job.values
     case = Case.model_validate(values["case"])
-    pace = _pace_of(json.dumps(values["case"]))
+    pace = _pace_of(case.model_dump_json())
     if "part" in values:
         days = len(weeks_of(case, values["part"])) * case.days
         return START_S + days * OPTIMUM_S_PER_DAY[values["part"]]
