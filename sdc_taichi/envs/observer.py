@@ -121,6 +121,10 @@ class Observer:
             features, self.state_features, commands, agents=agents, of_units=self._of_units
         )
         self.spaces = {agent: features_space(x) for agent, x in self.features.items()}
+        observed = {f for of_agent in self.features.values() for f in of_agent}
+        self._observed_of_view = [f for f in self._of_view if f in observed]
+        self._only_in_state = [f for f in self._of_view if f not in observed]
+        self._rows_of_measured = feature_slices((*self._measured, *self._of_view))
 
         slices, self._time_width = feature_slices(self.state_features), sum(f.size for f in of_time)
         entries = np.arange(sum(f.size for f in self.state_features))
@@ -191,6 +195,7 @@ class Observer:
         ``reset`` must have been called.
         """
         entries, width = self._entries_of(view), self._time_width
+        self._set_rows(entries.measured, self._only_in_state, view)
         end = width + len(entries.measured)
         out = np.empty((view.size, *(self.state_space.shape or ())), dtype=np.float32)
         out[:, :width] = entries.time.take(entries.row_numbers, axis=0)
@@ -219,7 +224,10 @@ class Observer:
         }
 
     def _measure(self, view: View) -> F32:
-        """Compute the scaled entries measured in the data center, (m, B), a contiguous row each."""
+        """Compute the scaled entries measured in the data center, (m, B), a contiguous row each.
+
+        The rows of features that only the state contains are set by ``state``.
+        """
         state, layout = view.state, self._layout
         setpoints = (
             state.setpoint_c.reshape(-1, layout.units).T
@@ -233,11 +241,19 @@ class Observer:
             speeds = state.fan_speed.reshape(-1, layout.fans).T
             inputs |= {f"fan_{i}": speed for i, speed in enumerate(speeds)}
         last = _AtRest(view) if view.last is None else view.last
-        measured: F32 = self._stage.rows(last=last, **inputs).astype(np.float32)
-        if not self._of_view:
-            return measured
-        of_view = [scale(f.value(view).astype(np.float32), f) for f in self._of_view]
-        return np.concatenate([measured, *of_view])
+        compiled = self._stage.rows(last=last, **inputs)
+        measured = np.empty(
+            (len(compiled) + sum(f.size for f in self._of_view), view.size), np.float32
+        )
+        measured[: len(compiled)] = compiled
+        self._set_rows(measured, self._observed_of_view, view)
+        return measured
+
+    def _set_rows(self, measured: F32, features: Sequence[Feature], view: View) -> None:
+        """Set the scaled entries of features of a view in an array of all measured entries."""
+        for f in features:
+            entries = scale(f.value(view).astype(np.float32), f)
+            measured[self._rows_of_measured[f.name]] = entries
 
     def _compile(self, view: View) -> None:
         """Compile the stage that maps the inputs from ``_measure`` to scaled entries."""
