@@ -303,7 +303,7 @@ def _set_flows(liquid: ti.template(), dc):
         m += liquid.one
     if lowest_c > 999.0:
         lowest_c = lowest_of_all_c
-    of_dc.facility_setpoint_c = lowest_c - of_dc.approach_k
+    of_dc.facility_setpoint_c = ti.max(lowest_c - of_dc.approach_k, of_dc.least_water_c)
     return of_dc.facility_pump * ti.min(1.0, of_dc.water_w_per_k / ti.max(water, 1.0))
 
 
@@ -732,6 +732,9 @@ def _cooler(liquid: ti.template(), dc, water, into_c, heat_w):
             air_c = of_dc.wet_c
             wets = 1
         k = ti.min(k, wanted)
+    if into_c <= air_c and heat_w <= of_dc.trim_w:
+        # Warmer air would only add heat: the water bypasses the cooler.
+        z, k = liquid.real(0.0), liquid.real(0.0)
     trim_w = clip(heat_w - k * drive_k, liquid.real(0.0), of_dc.trim_w)
     return air_c, z, k, trim_w
 

@@ -119,7 +119,6 @@ DC_COEFFICIENTS = {
     "cooler_side_share": "share of the water's film in that of both films",
     "fan_w": "power of the cooler's fans at full speed, in W",
     "min_fan": "smallest airflow of the cooler, as a share of design",
-    "trim_w": "capacity of the trim chiller, in W",
     "reuse_kind": "0 none, 1 direct, 2 heat pump",
     "reuse_demand_w": "largest heat that the consumer takes, in W",
     "reuse_effectiveness": "effectiveness of the exchanger of direct reuse",
@@ -138,6 +137,8 @@ DC_INPUTS = {
     "power_cap": "largest power of a GPU as a share of full load; 1 for no cap",
     "facility_pump": "share of the facility pumps that work, 0..1",
     "cooler_share": "share of the cooler's fans that work, 0..1",
+    "trim_w": "capacity of the trim chiller, or of the plant for its heat, in W",
+    "least_water_c": "lowest setpoint of the facility water, in C",
     "substeps": "number of substeps of a transient hall",
 }
 """Inputs of a step of each data center."""
@@ -156,7 +157,7 @@ DC_OUT = {
     "facility_pump_w": "mean power of the facility pumps, in W",
     "cooler_fan_w": "mean power of the cooler's fans, in W",
     "cooler_w": "mean heat that cooler or tower takes, in W",
-    "trim_load_w": "mean heat that the trim chiller takes, in W",
+    "trim_load_w": "mean heat that the trim chiller, or the plant in its place, takes, in W",
     "taken_w": "mean heat that reuse takes from facility water, in W",
     "heat_pump_w": "mean power of the heat pump, in W",
     "evaporated_w": "mean heat of evaporation of the water of wet pads, in W",

@@ -456,6 +456,9 @@ class LoopQuantities:
     """Heat that is delivered for reuse, with that of the heat pump's power."""
     liquid_rejected_w: Annotated[F64, Quantity("W")]
     """Heat of the facility water and of its trim chiller that is rejected to the outdoors."""
+    liquid_to_plant_w: Annotated[F64, Quantity("W")]
+    """Heat of the facility water that the plant of the CRAC units removes in place of a trim
+    chiller; ``heat_removed_w`` does not contain it."""
     liquid_stored_w: Annotated[F64, Quantity("W")]
     """Rate at which chips and loops store heat; only in transient halls."""
     cooler_water_l: Annotated[F64, Quantity("l")]

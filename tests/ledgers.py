@@ -136,12 +136,14 @@ LEDGERS: dict[str, Ledger] = {
         pump_heat_w(r),
         -r["economiser_w"],
         -r["chiller_load_w"],
+        r["liquid_to_plant_w"],
     ],
     "rejected heat": lambda r: [
         r["rejected_w"],
         -r["heat_removed_w"],
         -pump_heat_w(r),
         -r["chiller_w"],
+        -r["liquid_to_plant_w"],
     ],
     "work": lambda r: [
         r["arrived_tasks"],
@@ -202,6 +204,7 @@ LEDGERS: dict[str, Ledger] = {
         -r["liquid_air_w"],
         -r["reuse_w"],
         -r["liquid_rejected_w"],
+        -r["liquid_to_plant_w"],
         -r["liquid_stored_w"],
     ],
     "overhead": lambda r: [
@@ -245,5 +248,5 @@ def residual(terms: list[F64], floor: float = 0.0) -> F64:
     return np.asarray(np.abs(total) / np.where(largest > 0, largest, 1.0))
 
 
-OF_LIQUID = {"queue": 1, "hvac": 5, "water": 2, "liquid": 9}
+OF_LIQUID = {"queue": 1, "cooling": 1, "rejected heat": 1, "hvac": 5, "water": 2, "liquid": 10}
 """Number of the last terms of each balance that only halls with liquid-cooled racks have."""

@@ -44,6 +44,8 @@ FAILURES = [
         ("cdu_pump_down", {}),
         ("facility_pump_down", {"share": 0.4}),
         ("cooler_down", {"share": 0.3}),
+        ("chiller_derate", {"share": 0.3}),
+        ("pump_down", {"share": 0.3}),
         ("grid_outage", {}),
     )
 ]
@@ -69,6 +71,13 @@ def with_doors(effectiveness: float = 0.6) -> dict[str, Any]:
     return {"rack_types": types | {"web": web}}
 
 
+TRIMS: list[dict[str, Any]] = [
+    {"trim_kw": 0.0},
+    {"trim_kw": 300.0},
+    {"trim_kw": 300.0, "trim_by": "plant"},
+]
+
+
 def random_hall(rng: np.random.Generator, name: str, thermal: str) -> DataCenterConfig:
     kind = str(rng.choice(["none", "direct", "heat_pump"]))
     return liquid_hall(
@@ -83,7 +92,7 @@ def random_hall(rng: np.random.Generator, name: str, thermal: str) -> DataCenter
             "dew_point_c": [None, 15.0][rng.integers(2)],
             "facility": {
                 "rejection": str(rng.choice(["dry", "adiabatic", "tower"])),
-                "trim_kw": float(rng.choice([0.0, 300.0])),
+                **TRIMS[rng.integers(3)],
             },
             "reuse": {
                 "kind": kind,
@@ -144,7 +153,8 @@ def test_every_balance_closes_in_every_step(thermal: str) -> None:
             without = [term for k, term in enumerate(terms) if k != i]
             assert never or residual(without, floor=1e-3).max() > 1e-6, (name, i)
     # The run reaches what the balances are for.
-    for name in ("reuse_w", "heat_pump_w", "trim_load_w", "cooler_water_l", "throttled_tasks"):
+    reached = "reuse_w", "heat_pump_w", "trim_chiller_w", "liquid_to_plant_w", "cooler_water_l"
+    for name in (*reached, "throttled_tasks"):
         assert run[name].max() > 0.0, name
     assert run["tripped_racks"].max() > 0.0
     assert (run["liquid_stored_w"] != 0.0).any() == (thermal == "transient")
@@ -158,7 +168,7 @@ def test_a_data_center_is_the_same_alone_in_a_batch_and_after_a_snapshot(thermal
     air = load_config("corrected", ["name=air", f"simulation.thermal={thermal}"])
     units = ["hvac.crac.units=3", "hvac.crac.spare_units=1", "site.start=07-01"]
     configs = [liquid[0], apply_overrides(air, units), liquid[1]]
-    steps, half = 24, 12
+    steps, half, cooled_w = 24, 12, np.zeros(3)
     with Simulator(configs) as sim, Simulator(liquid[1]) as alone, Simulator(configs) as later:
         sim.reset(seed=4)
         alone.reset(seed=4)
@@ -169,9 +179,10 @@ def test_a_data_center_is_the_same_alone_in_a_batch_and_after_a_snapshot(thermal
             actions = Actions(cdu_setpoint_c=wanted_c, cdu_flow=0.7, power_cap=cap)
             result = sim.step(actions)
             assert_same([alone.step(actions)], [part_of(result, configs, 2)])
+            cooled_w = np.maximum(cooled_w, result.liquid_heat_w)
             if t >= half:
                 assert_same([later.step(actions)], [result])
-        assert np.all(result.liquid_heat_w[[0, 2]] > 0.0)
+        assert np.all(cooled_w[[0, 2]] > 0.0)
         assert result.liquid_heat_w[1] == result.cdu_pump_w[1] == 0.0
 
 
@@ -210,6 +221,62 @@ def test_a_transient_hall_starts_from_the_steady_heat_of_its_liquid_racks() -> N
         assert first.liquid_air_w[0] > 1e4
         assert abs(first.thermal_storage_w[0]) < 1.0
         assert abs(first.liquid_stored_w[0]) < 1.0
+
+
+def test_the_plant_of_the_crac_units_can_take_what_the_cooler_leaves() -> None:
+    outage = {"kind": "chiller_derate", "start_h": 14, "duration_h": 1, "share": 0.0}
+
+    def hall(trim_by: str, **more: Any) -> DataCenterConfig:
+        return liquid_hall(
+            trim_by,
+            site={"location": "AZ", "start": "07-10"},
+            liquid={"setpoint_c": 24, "facility": {"trim_kw": 1500, "trim_by": trim_by}},
+            **more,
+        )
+
+    events = {"events": {"scheduled": [outage]}}
+    configs = [hall("chiller", **events), hall("plant", **events), hall("plant")]
+    with Simulator(configs, precision="f64") as sim:
+        sim.reset()
+        sized = sim.sizing.water_side
+        assert sized.cooling_w[1] == pytest.approx(sized.cooling_w[0] + 1500e3)
+        assert sized.coils_w[1] == pytest.approx(sized.coils_w[0])
+        steps = [sim.step() for _ in range(64)]
+        # Facility water stays warmer than the chilled water, whose temperature follows the air.
+        sim.step(Actions(cdu_setpoint_c=20.0, facility_approach_k=15.0))
+        for _ in range(8):
+            coldest = sim.step(Actions(cooling=1.0, facility_approach_k=15.0))
+    hot = steps[52]
+    assert hot.outdoor_c[0] > 35.0
+    assert not hot.cooler_fan_w.any(), "air that is warmer than the water would heat it"
+    np.testing.assert_allclose(hot.facility_supply_c, 20.0)
+    assert hot.liquid_to_plant_w[1] == pytest.approx(hot.trim_load_w[0])
+    assert hot.trim_load_w[1] == hot.trim_chiller_w[1] == hot.liquid_to_plant_w[0] == 0.0
+    taken_w = hot.economiser_w + hot.chiller_load_w
+    assert taken_w[1] - taken_w[0] > 0.99 * hot.trim_load_w[0]
+    assert hot.evaporation_l[1] > 1.5 * hot.evaporation_l[0]
+    # Without chillers the water warms up, unless the loop has one of its own.
+    failed = steps[57]
+    assert failed.liquid_to_plant_w[1] == 0.0 < failed.liquid_to_plant_w[2]
+    assert failed.facility_supply_c[1] > failed.facility_supply_c[0] + 10.0
+    np.testing.assert_allclose(coldest.facility_supply_c[2], coldest.chilled_water_c[2] + 2.0)
+    assert coldest.facility_supply_c[0] < coldest.facility_supply_c[2]
+
+
+def test_a_transient_hall_keeps_its_air_while_the_plant_cools_facility_water() -> None:
+    of_air = []
+    for trim_by in ("chiller", "plant"):
+        config = liquid_hall(
+            simulation={"thermal": "transient"},
+            site={"location": "AZ", "start": "07-10"},
+            liquid={"setpoint_c": 24, "facility": {"trim_kw": 1500, "trim_by": trim_by}},
+        )
+        with Simulator(config) as sim:
+            sim.reset()
+            steps = [sim.step() for _ in range(60)]
+        of_air.append([step.inlet_max_c[0] for step in steps])
+    assert max(step.liquid_to_plant_w[0] for step in steps) > 1e5
+    np.testing.assert_allclose(of_air[0], of_air[1], atol=0.05)
 
 
 def test_steady_air_is_guessed_with_the_heat_that_coolant_leaves_to_it() -> None:
@@ -337,6 +404,11 @@ def test_commands_move_setpoints_slowly_and_are_checked() -> None:
         (["liquid.setpoint_c=10"], "liquid.setpoint_c: should be greater than or equal to 20"),
         (["liquid.reuse.share=0.5"], "share 0.5 needs kind direct or heat_pump, not none"),
         (["liquid.reuse.network_return_c=80"], "network_supply_c 70 must be above network_return"),
+        (["liquid.facility.trim_by=plant"], "trim_by plant needs trim_kw above 0"),
+        (
+            ["liquid.facility={trim_by: plant, trim_kw: 9}", "hvac.plant=air_side"],
+            "hvac.plant air_side: its outdoor air cools no water; valid is plant water_cooled or",
+        ),
         (["workload.model=tasks"], "liquid-cooled racks need workload.model fluid"),
         (
             ["events.scheduled=[{kind: leak, start_h: 1, duration_h: 1, rack: 4, litres: 3}]"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -123,6 +124,7 @@ def test_diagram_shows_the_devices_of_the_config(recorded: Recorded) -> None:
     for more, shown, hidden in (
         ([], "heat pump", "trim chiller"),
         (["liquid.reuse={}", "liquid.facility.trim_kw=300"], "trim chiller", "delivered"),
+        (["liquid.facility={trim_kw: 300, trim_by: plant}"], "CRAC plant", "trim chiller"),
     ):
         liquid = load_config("corrected", SMALL + more).liquid
         assert liquid is not None
@@ -268,6 +270,14 @@ def test_show_describes_heat_cdus_and_water() -> None:
     assert "type gpu: 4 racks of 132.0 kW: 115.0 kW into 138 l/min of coolant" in text
     assert "1 loop with 2 CDUs of 520 kW each, 1 of them needed (N+1)" in text
     assert "at most 36.0 C keeps the setpoint (class W32)" in text
+    hot = [*SMALL, "hvac.sizing.design_outdoor_c=45", "liquid.setpoint_c=25"]
+    for trim_by, shown_text in (("chiller", "trim chiller takes"), ("plant", "CRAC units takes")):
+        more = f"liquid.facility={{trim_kw: 900, trim_by: {trim_by}}}"
+        shown_kw = re.search(
+            rf"{shown_text} ([0-9.]+) kW", call("hall", "show", "corrected", *hot, more).stdout
+        )
+        assert shown_kw is not None
+        assert float(shown_kw[1]) > 200.0
 
 
 def test_a_hall_with_rear_doors_alone_has_no_junctions(tmp_path: Path) -> None:

@@ -161,13 +161,14 @@ def test_transient_halls_agree_with_the_twin(
                 # What exceeds a limit inherits the absolute error of each inlet.
                 scale = 0.01 * len(part.twin.rack)
             np.testing.assert_allclose(
-                getattr(sums, name)[where], expected, rtol=rel, atol=rel * scale + 1e-9,
+                getattr(sums, name)[where], expected, rtol=rel, atol=rel * abs(scale) + 1e-9,
                 err_msg=f"{configs[i].name} {name}",
             )  # fmt: skip
         for f in fields(reference_twin.Memory):
-            scale = 900.0 * through if f.name == "room_j" else 0.0
+            # What racks capture is a small difference of large airflows.
+            scale = {"room_j": 900.0 * through, "captured_m3s": 1e-3}.get(f.name, 0.0)
             np.testing.assert_allclose(
-                getattr(own, f.name), getattr(left, f.name), rtol=rel, atol=rel * scale + 1e-9,
+                getattr(own, f.name), getattr(left, f.name), rtol=rel, atol=rel * abs(scale) + 1e-9,
                 err_msg=f"{configs[i].name} {f.name}",
             )  # fmt: skip
 

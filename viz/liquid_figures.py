@@ -48,6 +48,7 @@ HEAT = (
     ("liquid_air_w", GREY, "into the hall's air"),
     ("reuse_w", GREEN, "delivered as heat"),
     ("liquid_rejected_w", SKY, "rejected outdoors"),
+    ("liquid_to_plant_w", ORANGE, "to the plant of the CRAC units"),
     ("liquid_stored_w", PINK, "stored"),
 )
 """Parts, in W, into which the power of liquid-cooled racks and their loops divides: column, colour,

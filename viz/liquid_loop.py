@@ -30,6 +30,7 @@ LOOP_FIELDS = (
     "cooler_fan_w",
     "trim_load_w",
     "trim_chiller_w",
+    "liquid_to_plant_w",
 )
 """Fields of ``StepResult`` that the texts of the diagram show."""
 SIZE = (400.0, 150.0)
@@ -63,7 +64,8 @@ BOXES = {
     "trim": Box("trim chiller", 240, 88, 312, 128),
     "cooler": Box("cooler", 336, 26, 396, 122),
 }
-"""Devices of the diagram; a data center may have no heat reuse and no trim chiller."""
+"""Devices of the diagram; a data center may have no heat reuse and no trim chiller, or the plant of
+the CRAC units in place of the latter."""
 _HOT_Y, _COLD_Y = 40.0, 108.0
 PLACES = {
     **{name: box.middle for name, box in BOXES.items()},
@@ -129,11 +131,14 @@ def loop_texts(
     heat_pump = f"\nheat pump {kw('heat_pump_w')}" * (liquid.reuse.kind == "heat_pump")
     # Racks with rear doors alone have no junctions.
     hottest = f"junction {water('junction_max_c')}" if values["junction_max_c"] else "rear doors"
+    by_plant = liquid.facility.trim_by == "plant"
     texts = {
         "racks": f"\n{hottest}\nto coolant {kw('liquid_heat_w')}",
         "cdus": f"\npumps {kw('cdu_pump_w')}",
         "reuse": heat_pump,
-        "trim": f"\ntakes {kw('trim_load_w')}\npower {kw('trim_chiller_w')}",
+        "trim": f"\ntakes {kw('liquid_to_plant_w')}"
+        if by_plant
+        else f"\ntakes {kw('trim_load_w')}\npower {kw('trim_chiller_w')}",
         "cooler": f"\nfans {kw('cooler_fan_w')}\npump {kw('facility_pump_w')}",
         "coolant return": water("cdu_return_c"),
         "coolant supply": water("cdu_supply_c", "coolant_m3s"),
@@ -145,7 +150,9 @@ def loop_texts(
     }
     if not has_device(liquid, "reuse"):
         del texts["delivered"]
-    named = {place: BOXES[place].name + text for place, text in texts.items() if place in BOXES}
+    names = {place: box.name for place, box in BOXES.items()}
+    names |= {"trim": "CRAC plant"} if by_plant else {}
+    named = {place: names[place] + text for place, text in texts.items() if place in BOXES}
     return {place: text for place, text in (texts | named).items() if has_device(liquid, place)}
 
 

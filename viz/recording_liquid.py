@@ -55,6 +55,7 @@ LIQUID_PLOTS: dict[str, Plot] = {
             ("into hall air", "liquid_air_w", GREY),
             ("delivered", "reuse_w", GREEN),
             ("rejected", "liquid_rejected_w", SKY),
+            ("to CRAC plant", "liquid_to_plant_w", ORANGE),
             ("stored", "liquid_stored_w", PINK),
         ),
     ),

@@ -537,6 +537,14 @@ def _liquid_lines(design: DesignHall) -> list[str]:
     per_loop = count_text(v["cdus_per_manifold"], "CDU")
     needed = v["cdus_per_manifold"] - v["spare_cdus_per_manifold"]
     redundancy = f"N+{v['spare_cdus_per_manifold']}" if v["spare_cdus_per_manifold"] else "N"
+    trimmed = ""
+    if v["trim_load_w"] > 0.0:
+        trimmed = (
+            f"; trim chiller takes {v['trim_load_w'] / 1e3:,.1f} kW with "
+            f"{v['trim_chiller_w'] / 1e3:,.1f} kW"
+        )
+    elif v["liquid_to_plant_w"] > 0.0:
+        trimmed = f"; plant of the CRAC units takes {v['liquid_to_plant_w'] / 1e3:,.1f} kW"
     lines = [
         f"liquid        {count_text(v['racks'], 'rack')}, {v['liquid_it_w'] / 1e3:,.1f} kW IT: "
         f"{v['liquid_heat_w'] / 1e3:,.1f} kW into coolant, {v['liquid_air_w'] / 1e3:,.1f} kW into "
@@ -550,7 +558,7 @@ def _liquid_lines(design: DesignHall) -> list[str]:
         f"facility      {v['facility_supply_c']:.1f} C to {v['facility_return_c']:.1f} C outdoors "
         f"at {v['outdoor_c']:.1f} C, wet bulb {v['wet_bulb_c']:.1f} C; {config.facility.rejection} "
         f"cooler, fans {v['cooler_fan_w'] / 1e3:,.1f} kW, pumps "
-        f"{v['facility_pump_w'] / 1e3:,.1f} kW",
+        f"{v['facility_pump_w'] / 1e3:,.1f} kW" + trimmed,
         f"water         at most {v['facility_setpoint_c']:.1f} C keeps the setpoint "
         f"({class_text(v['facility_class'])})",
     ]

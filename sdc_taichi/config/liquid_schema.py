@@ -313,11 +313,20 @@ class LiquidFacilityConfig(Section):
     """Concentration of salts in the water of adiabatic coolers and towers divided by that of the
     make-up water, 1.1..100; it defines the blowdown."""
     trim_kw: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Capacity of a chiller that removes what the cooler leaves, in kW, 0..1e6; 0 means none."""
+    """Heat that can be removed from what the cooler leaves, in kW, 0..1e6; 0 means none."""
+    trim_by: Literal["chiller", "plant"] = "chiller"
+    """What removes this heat: a trim chiller of the loop, or, through an exchanger, the chilled
+    water of the plant of the CRAC units, which is sized for it."""
     w_class: Literal["W17", "W27", "W32", "W40", "W45", "W+"] | None = None
     """ASHRAE TC 9.9 (2021) class of the facility water, which names its highest temperature in C;
     ``W+`` has none. Devices that cannot keep it on the design day raise a warning. None means no
     class."""
+
+    @model_validator(mode="after")
+    def _plant_has_a_capacity(self) -> Self:
+        if self.trim_by == "plant" and self.trim_kw == 0.0:
+            raise ValueError("trim_by plant needs trim_kw above 0, the heat that the plant takes")
+        return self
 
 
 class ReuseConfig(Section):

@@ -418,6 +418,11 @@ class DataCenterConfig(Section):
         for condition, is_met in needs.items():
             if not is_met:
                 raise ValueError(f"liquid-cooled racks need {condition}")
+        if self.liquid.facility.trim_by == "plant" and self.hvac.plant == "air_side":
+            raise ValueError(
+                "liquid.facility.trim_by plant with hvac.plant air_side: its outdoor air cools no "
+                "water; valid is plant water_cooled or air_cooled, or trim_by chiller"
+            )
         return self
 
     @model_validator(mode="after")

@@ -554,9 +554,10 @@ def facility_return(view: View) -> F64:
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, _of_liquid)
 def trim_load(view: View) -> F64:
-    """Heat that the trim chiller removed in the last step, divided by its capacity."""
+    """Heat taken by trim chiller or plant in the last step, divided by ``trim_kw``."""
     capacity_w = view.fleet.values("liquid.facility.trim_kw") * 1e3
-    return _of_loop(view, "trim_load_w") / np.maximum(capacity_w, 1.0)
+    taken_w = _of_loop(view, "trim_load_w") + _of_loop(view, "liquid_to_plant_w")
+    return taken_w / np.maximum(capacity_w, 1.0)
 
 
 @_feature(_OF_VIEW, "share", 0.0, 1.0, _of_liquid)

@@ -137,7 +137,7 @@ def loop_map(
             states = trials[counts].at(tried.reshape(3, -1), conditions)
             lack_k = np.maximum(MARGIN_K - states.headroom_k, 0.0)
             excess = PENALTY_PER_K * lack_k + PENALTY_OF_WORK * states.lost
-            cost = states.power_w * (1.0 + excess) + AIR_SIDE_W_PER_W * states.air_w
+            cost = states.power_w * (1.0 + excess) + AIR_SIDE_W_PER_W * states.plant_load_w
             best = cost.reshape(levels, -1).argmin(axis=1)
             middle = tried[:, np.arange(levels), best]
             # The next grid spans the neighbours of the best point of the first one.
@@ -242,7 +242,7 @@ class LoopCommands:
             for i, each in enumerate(offsets):
                 tried = in_range(centre[:, None] + 0.5**i * _SPANS[:, None] * each)
                 states = trials.at(tried, conditions)
-                cost_w = states.power_w + AIR_SIDE_W_PER_W * states.air_w
+                cost_w = states.power_w + AIR_SIDE_W_PER_W * states.plant_load_w
                 cost_w[states.lost > 0.0] = np.inf
                 costs_w += [cost_w[0], cost_w.min()]
                 centre = tried[:, cost_w.argmin()]

@@ -168,7 +168,10 @@ class PlantParameters:
     cycles: Values = 5.0
     """Concentration of solids in the water of pads or tower divided by make-up water, (B,)."""
     trim_w: Values = 0.0
-    """Cooling capacity of the trim chiller, in W, (B,)."""
+    """Cooling capacity of the trim chiller or of the exchanger to the plant, in W, (B,)."""
+    trim_by_plant: Values = 0.0
+    """1 if the chilled water of the plant of the CRAC units takes the heat that the cooler leaves,
+    0 for a trim chiller, (B,)."""
     trim_cop: Values = np.nan
     """COP of the trim chiller, (B,); nan for the model ``carnot`` of ``plant/chiller.py``."""
     reuse_kind: Values = 0.0
@@ -255,6 +258,9 @@ def _items(offsets: Offsets) -> Offsets:
     return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
+PLANT_APPROACH_K = 2.0
+"""Facility water minus chilled water of the plant that cools it, at least, in K; usual approaches
+of plate exchangers are 1 to 3 K."""
 SPARE_CAPACITY = 1.13
 """Capacity of CDUs divided by the design heat of their racks, if none is configured."""
 WATER_KG_M3 = 995.0

@@ -112,6 +112,14 @@ class WaterSideDesign:
     """1 if the plant humidifies outdoor air that is too dry, 0 if it rejects such air, (B,)."""
     most_humidity: F64
     """Largest relative humidity of outdoor air heated to the supply setpoint, 0..1, (B,)."""
+    facility_water_w: Values = 0.0
+    """Part of ``cooling_w`` that cools the facility water of liquid-cooled racks instead of coils,
+    in W, (B,)."""
+
+    @property
+    def coils_w(self) -> F64:
+        """Cooling capacity of the coils, in W, (B,)."""
+        return as_array(self.cooling_w - self.facility_water_w)
 
 
 def chilled_water_c(setpoint_c: F64, design: WaterSideDesign) -> F64:

@@ -314,7 +314,7 @@ def _limits(fleet: Fleet, solver: Hall) -> _Limits:
     """
     inputs = load_drivers(fleet.configs)
     sizing = size(fleet, solver, inputs.design_outdoor_c, inputs.design_wet_bulb_c)
-    plant_kw = float(sizing.water_side.cooling_w[0]) / 1e3
+    plant_kw = float(sizing.water_side.coils_w[0]) / 1e3
     unit_kw = np.where(np.isfinite(fleet.unit_capacity_w), fleet.unit_capacity_w / 1e3, np.inf)
     grid_kw = float(sizing.grid_limit_kw[0])
     ups_w = np.broadcast_to(sizing.power_path.ups.rated_w, 1)[0]

@@ -78,7 +78,12 @@ class SteadyAir:
         return {**self._no_memory, "group_inlet_c": self._inlets.initial()}
 
     def solve(
-        self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
+        self,
+        state: State,
+        placement: Placement,
+        supply: Supply,
+        surroundings: Surroundings,
+        to_plant_w: F64 | None = None,
     ) -> tuple[HallSums, dict[str, Any]]:
         """Compute airflows, temperatures and power of a step.
 
@@ -87,6 +92,8 @@ class SteadyAir:
             placement: Placement of the work.
             supply: Operation of the CRAC units.
             surroundings: Failures of the step.
+            to_plant_w: Heat of facility water that the plants remove beside that of the coils, in
+                W, (B,); only transient halls read it. None if there is none.
 
         Returns:
             Results of the step, and the temperatures at its end by their field names in ``State``.
@@ -117,7 +124,7 @@ class TransientAir:
         fleet: Fleet,
         hall: Hall,
         sizing: Sizing,
-        limits_w: Callable[[Surroundings, Supply, UnitAir], Mapping[str, F64]],
+        limits_w: Callable[[Surroundings, Supply, UnitAir, F64 | None], Mapping[str, F64]],
         *,
         keep_inlets: bool,
     ) -> None:
@@ -143,7 +150,12 @@ class TransientAir:
         return {**fields_of(steady), "group_inlet_c": self._inlets.initial()}
 
     def solve(
-        self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
+        self,
+        state: State,
+        placement: Placement,
+        supply: Supply,
+        surroundings: Surroundings,
+        to_plant_w: F64 | None = None,
     ) -> tuple[HallSums, dict[str, Any]]:
         """Compute a transient step; arguments and results as in ``SteadyAir.solve``.
 
@@ -169,7 +181,7 @@ class TransientAir:
             flow_m3s=flow_m3s,
             warmed_k=at_start_k,
         )
-        limits = self._limits_w(surroundings, supply, unit_air)
+        limits = self._limits_w(surroundings, supply, unit_air, to_plant_w)
         coil = Coil(
             setpoint_c=supply.coldest_supply_c,
             room_j=room_j,

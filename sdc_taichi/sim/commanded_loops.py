@@ -44,8 +44,9 @@ class LoopStates:
 
     power_w: F64
     """Power of the liquid-cooled racks and of their pumps, fans, chillers and heat pumps, in W."""
-    air_w: F64
-    """Heat of these racks, their lines and pumps that goes into the air of the hall, in W."""
+    plant_load_w: F64
+    """Heat that the plant of the CRAC units removes, in W: that of these racks, their lines and
+    pumps in the air of the hall, and that which it takes from facility water."""
     lost: F64
     """Work that hot GPUs do not complete, as a share of what the racks complete at full load."""
     headroom_k: F64
@@ -104,7 +105,7 @@ class CommandedLoops:
             + result.cooler_fan_w
             + result.trim_chiller_w
             + result.heat_pump_w,
-            air_w=result.liquid_air_w,
+            plant_load_w=result.liquid_air_w + result.liquid_to_plant_w,
             lost=result.lost_utilisation.reshape(n, -1).mean(axis=1),
             headroom_k=(self._throttle_c - junction_c).min(axis=1),
         )

@@ -125,7 +125,8 @@ def design_liquid_values(design: DesignLiquid) -> dict[str, Any]:
     names = (
         *("liquid_it_w", "liquid_heat_w", "liquid_air_w", "cdu_supply_c"),
         *("cdu_return_c", "facility_supply_c", "facility_return_c", "cdu_pump_w"),
-        *("facility_pump_w", "cooler_fan_w", "trim_chiller_w"),
+        *("facility_pump_w", "cooler_fan_w", "trim_load_w", "trim_chiller_w"),
+        "liquid_to_plant_w",
     )
     return {
         "racks": len(design.indices),

@@ -85,6 +85,7 @@ class LiquidLoads(Protocol):
     more_it_w: F64
     overhead_w: F64
     more_water_l: F64
+    to_plant_w: F64 | None
 
 
 def battery_parameters(fleet: Fleet) -> BatteryParameters:
@@ -156,10 +157,15 @@ class Facility:
         self._air_j_per_m3_k = air_j_per_m3_k(fleet)
         self._return_approach_k = mean_return_approach_k(fleet)
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
+        self._cools_liquid = bool(np.any(sizing.water_side.facility_water_w > 0.0))
         self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
 
     def removable_w(
-        self, surroundings: Surroundings, supply: Supply, air: UnitAir
+        self,
+        surroundings: Surroundings,
+        supply: Supply,
+        air: UnitAir,
+        to_plant_w: F64 | float = 0.0,
     ) -> dict[str, F64]:
         """Compute the heat that the plant can remove, and that coils and pumps can carry.
 
@@ -172,6 +178,8 @@ class Facility:
             surroundings: Weather and failures.
             supply: Operation of the CRAC units.
             air: Air and water of the CRAC units at the start of the step.
+            to_plant_w: Heat of facility water, which the plant removes before that of the coils, in
+                W, (B,).
 
         Returns:
             ``limit_w`` and ``carried_w``, in W, ``limit_w_per_k``, in W/K, and ``limit_w_per_w``,
@@ -181,7 +189,7 @@ class Facility:
 
         def plant(load_share: float, warmer_k: float) -> WaterSideResult:
             return self._operate(
-                load_share * capacity_w,
+                load_share * capacity_w + to_plant_w,
                 surroundings,
                 supply,
                 air.return_c + warmer_k,
@@ -190,8 +198,8 @@ class Facility:
             )
 
         full, warmer, less = plant(1.0, 0.0), plant(1.0, WARMER_K), plant(LESS_LOAD, 0.0)
-        removed_w = full.heat_removed_w
-        per_k = np.maximum(warmer.heat_removed_w - removed_w, 0.0) / WARMER_K
+        removed_w = full.heat_removed_w - to_plant_w
+        per_k = np.maximum(warmer.heat_removed_w - full.heat_removed_w, 0.0) / WARMER_K
         less_w = (1.0 - LESS_LOAD) * capacity_w
         per_w = (full.economiser_w - less.economiser_w) / np.maximum(less_w, LEAST_PUMPED_W)
         design = self._sizing.water_side
@@ -208,7 +216,7 @@ class Facility:
             "limit_w_per_k": per_k,
             "limit_w_per_w": per_w,
             "carried_w": np.minimum(
-                capacity_w, self._while_powered(coil_capacity_w(design), surroundings)
+                capacity_w, self._while_powered(coil_capacity_w(design), surroundings) - to_plant_w
             ),
         }
 
@@ -225,11 +233,14 @@ class Facility:
         if inputs.liquid is not None:
             it_w = air_w + inputs.liquid.more_it_w
         air = self._crac_air(inputs, air_w)
-        requested_w = self._requested_w(inputs, air)
+        to_plant_w: F64 | float = 0.0
+        if self._cools_liquid and inputs.liquid is not None:
+            to_plant_w = cast(F64, inputs.liquid.to_plant_w)
+        requested_w = self._requested_w(inputs, air) + to_plant_w
         at = inputs.surroundings, inputs.supply, air.return_c, air.crac_flow_m3s
         plant = self._operate(requested_w, *at)
         if self._transient:
-            carried_w = np.maximum(self._carried_w(inputs), 0.0)
+            carried_w = np.maximum(self._carried_w(inputs), 0.0) + to_plant_w
             # A plant that cools water and tank removes more than the coils bring.
             fullest_w = np.maximum(carried_w, requested_w)
             fullest = self._operate(fullest_w, *at, inputs.air.most_warmed_k)
@@ -237,6 +248,7 @@ class Facility:
             opened = np.minimum(inputs.air.most_warmed_k / VALVE_BAND_K, 1.0)
             least_w = opened * fullest.chilled_pump_w
             plant = self._with_coil_pumps(plant, carried_w, least_w, inputs.surroundings)
+        plant = replace(plant, heat_removed_w=plant.heat_removed_w - to_plant_w)
         heat = self._balance_heat(inputs, air, plant)
         water = self._use_water(inputs, air, plant)
         hvac_w = self._hvac_w(air, plant)
@@ -544,7 +556,7 @@ class Facility:
 
     def _coil_capacity_w(self, surroundings: Surroundings, supply: Supply) -> F64:
         """Return the mean heat that the coils in use can remove during the step, in W, (B,)."""
-        cooling_w = self._sizing.water_side.cooling_w
+        cooling_w = self._sizing.water_side.coils_w
         if not self._event_free:
             cooling_w = cooling_w * supply.coil_share * surroundings.powered
         if not self._limits_coils:
@@ -572,9 +584,16 @@ class FacilityStage:
         self._step = CompiledStage(lambda **x: _checked_step(facility, **x), fleet.size)
         self._removable = CompiledStage(facility.removable_w, fleet.size)
 
-    def limits_w(self, surroundings: Surroundings, supply: Supply, air: UnitAir) -> dict[str, F64]:
+    def limits_w(
+        self,
+        surroundings: Surroundings,
+        supply: Supply,
+        air: UnitAir,
+        to_plant_w: F64 | None = None,
+    ) -> dict[str, F64]:
         """Run ``Facility.removable_w``, with its arguments and results."""
-        return self._removable(surroundings=surroundings, supply=supply, air=air)
+        stages: dict[str, Any] = {} if to_plant_w is None else {"to_plant_w": to_plant_w}
+        return self._removable(surroundings=surroundings, supply=supply, air=air, **stages)
 
     def step(
         self,

@@ -16,6 +16,7 @@ from sdc_taichi.plant.liquid import (
     COOLER_SIDE_SHARE,
     COOLER_WALL_SHARE,
     M3S_PER_LPM,
+    PLANT_APPROACH_K,
     REJECTION_KINDS,
     LiquidFleet,
     size_liquid,
@@ -55,6 +56,8 @@ LEAST_FLOW = 0.5
 failures."""
 MOST_FLOW = 1.1
 """Largest flow of coolant, as a share of design."""
+NO_LEAST_C = -1000.0
+"""Lowest setpoint of facility water that nothing limits, in C."""
 LEAST_CAPTURE, LEAST_K_PER_W, LEAST_LOSS_W_PER_K = 1e-3, 1e-6, 1.0
 """Lower bounds of the share of the heat of chips in the coolant, of their resistance in K/W, and of
 the losses of the pipes of a rack in W/K, so that every heat flow has a temperature."""
@@ -112,6 +115,11 @@ class LiquidInputs:
     """Share of the facility pumps that work, 0..1, (B,)."""
     cooler_share: F64 | None = None
     """Share of the cooler's fans that work, 0..1, (B,)."""
+    plant_share: F64 | None = None
+    """Share of chillers and pumps of the plant of the CRAC units that work, 0..1, (B,); read for
+    data centers whose plant cools facility water."""
+    chilled_water_c: F64 | None = None
+    """Chilled water of that plant, in C, (B,); None does not limit the facility water."""
     rack_valve: F64 | None = None
     """Opening of the valve of each rack, 0..1, (L,); a rack with cold plates at 0, such as one that
     leaks, is off."""
@@ -175,6 +183,8 @@ class Liquid:
         self._is_tower = rejection == _TOWER
         self._trims = bool(np.any(self._per_dc(plants.trim_w) > 0.0))
         self._trim_w, self._trim_cop = self._per_dc(plants.trim_w), self._per_dc(plants.trim_cop)
+        self.by_plant = self._per_dc(plants.trim_by_plant) > 0.0
+        """True for data centers whose plant of the CRAC units cools facility water, (B,)."""
         cycles = self._per_dc(plants.cycles)
         self._litres_per_w = step_s / EVAPORATION_HEAT_J_PER_KG * cycles / (cycles - 1.0)
         self._income_per_w = self._per_dc(plants.heat_price_per_kwh) * (step_s / 3.6e6)
@@ -231,6 +241,8 @@ class Liquid:
         for name in ("up", "pumps", "facility_pump", "cooler_share"):
             self._inputs[name][:] = 1.0
         self._inputs["substeps"][:] = self._usual_substeps
+        self._inputs["trim_w"][:] = self._trim_w
+        self._inputs["least_water_c"][:] = NO_LEAST_C
         self._had_failures = False
         self._arrays |= {
             "rack_coefficients": self._packed(
@@ -305,8 +317,18 @@ class Liquid:
         if self._has_towers:
             air_c = np.where(self._is_tower, inputs.wet_bulb_c + TOWER_APPROACH_K, air_c)
         self._set_air(air_c, inputs)
+        if self.by_plant.any():
+            self._set_plant(inputs)
         self._set_failures(inputs)
         return setpoint_c, flow
+
+    def _set_plant(self, inputs: LiquidInputs) -> None:
+        """Write what the plant of the CRAC units can do for facility water."""
+        share, water_c = inputs.plant_share, inputs.chilled_water_c
+        by_plant = self._trim_w if share is None else self._trim_w * share
+        self._inputs["trim_w"][:] = np.where(self.by_plant, by_plant, self._trim_w)
+        least_c = NO_LEAST_C if water_c is None else water_c + PLANT_APPROACH_K
+        self._inputs["least_water_c"][:] = np.where(self.by_plant, least_c, NO_LEAST_C)
 
     def _set_air(self, air_c: F64, inputs: LiquidInputs) -> None:
         """Write the temperature of the air or tower water that cools, without and with pads."""
@@ -424,8 +446,12 @@ class Liquid:
             fan_w = np.where(self._is_tower, self._tower(inputs).fan_w, fan_w)
             evaporated_w = np.where(self._is_tower, np.maximum(dc["cooler_w"], 0.0), evaporated_w)
         chiller_w = np.zeros(self._size)
-        if self._trims and dc["trim_load_w"].any():
-            chiller_w = self._trim_chiller_w(dc, inputs)
+        trim_load_w, to_plant_w = dc["trim_load_w"], np.zeros(self._size)
+        if self.by_plant.any():
+            to_plant_w = np.where(self.by_plant, trim_load_w, 0.0)
+            trim_load_w = trim_load_w - to_plant_w
+        if self._trims and trim_load_w.any():
+            chiller_w = self._trim_chiller_w(trim_load_w, dc["facility_setpoint_c"], inputs)
         reuse_w = dc["taken_w"] + dc["heat_pump_w"]
         return LiquidResult(
             liquid_it_w=dc["it_w"],
@@ -443,10 +469,11 @@ class Liquid:
             facility_pump_w=dc["facility_pump_w"],
             cooler_fan_w=fan_w,
             trim_chiller_w=chiller_w,
-            trim_load_w=dc["trim_load_w"],
+            trim_load_w=trim_load_w,
             heat_pump_w=dc["heat_pump_w"],
             reuse_w=reuse_w,
-            liquid_rejected_w=dc["cooler_w"] + dc["trim_load_w"] + chiller_w,
+            liquid_rejected_w=dc["cooler_w"] + trim_load_w + chiller_w,
+            liquid_to_plant_w=to_plant_w,
             liquid_stored_w=dc["stored_w"],
             cooler_water_l=evaporated_w * self._litres_per_w,
             leak_l=np.zeros(self._size) if inputs.leak_l is None else inputs.leak_l,
@@ -466,17 +493,17 @@ class Liquid:
             tripped=rack["tripped"],
         )
 
-    def _trim_chiller_w(self, dc: dict[str, F64], inputs: LiquidInputs) -> F64:
+    def _trim_chiller_w(self, load_w: F64, water_c: F64, inputs: LiquidInputs) -> F64:
         """Return the power of the trim chillers, whose condensers stand in outdoor air, in W."""
         point = ChillerPoint(
             reference_w=self._trim_w,
-            chilled_water_c=dc["facility_setpoint_c"],
+            chilled_water_c=water_c,
             condenser_c=inputs.outdoor_c + self._cooler_approach_k,
             outdoor_c=inputs.outdoor_c,
             machine=ChillerParameters(CHILLERS["carnot"].reference_cop),
         )
-        by_cop_w = dc["trim_load_w"] / np.where(np.isnan(self._trim_cop), 1.0, self._trim_cop)
-        by_model_w = carnot(dc["trim_load_w"], point).power_w
+        by_cop_w = load_w / np.where(np.isnan(self._trim_cop), 1.0, self._trim_cop)
+        by_model_w = carnot(load_w, point).power_w
         return np.where(np.isnan(self._trim_cop), by_model_w, by_cop_w)
 
     @property
@@ -642,7 +669,6 @@ class Liquid:
             "fan_w": np.where(self._is_tower, 0.0, sizes.fan_w),
             # The pumps of towers keep the flow through the exchanger.
             "min_fan": np.where(self._is_tower, 1.0, p.min_fan),
-            "trim_w": p.trim_w,
             "reuse_kind": p.reuse_kind,
             "reuse_demand_w": p.reuse_demand_w,
             "reuse_effectiveness": p.reuse_effectiveness,

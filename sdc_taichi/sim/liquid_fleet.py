@@ -70,6 +70,8 @@ class LiquidDesign(NamedTuple):
     """Heat of lines and pumps that goes into the air of the hall, in W, (B,)."""
     overhead_w: F64
     """Electric power of pumps, fans, trim chiller and heat pump, in W, (B,)."""
+    to_plant_w: F64
+    """Heat that the plant of the CRAC units takes from facility water, in W, (B,)."""
 
 
 def liquid_design(fleet: LiquidFleet) -> LiquidDesign:
@@ -98,11 +100,13 @@ def liquid_design(fleet: LiquidFleet) -> LiquidDesign:
     is_pumped = plants.reuse_kind == REUSE_KINDS.index("heat_pump")
     pumped_w = np.minimum(sized.heat_w / np.maximum(cop - 1.0, 0.1), plants.reuse_demand_w)
     overhead_w = pumps_w + sized.facility_pump_w + sized.fan_w
-    overhead_w = overhead_w + plants.trim_w / CHILLERS["carnot"].reference_cop
+    to_plant_w = np.asarray(plants.trim_w * plants.trim_by_plant)
+    overhead_w = overhead_w + (plants.trim_w - to_plant_w) / CHILLERS["carnot"].reference_cop
     return LiquidDesign(
         liquid_w=of_racks(racks.liquid_design_w),
         to_air_w=lines_w + losses_w,
         overhead_w=overhead_w + np.where(is_pumped, pumped_w, 0.0),
+        to_plant_w=to_plant_w,
     )
 
 
@@ -161,6 +165,7 @@ def _plant_parameters(plants: Sequence[LiquidConfig]) -> PlantParameters:
         rejection=_array([REJECTION_KINDS.index(p.facility.rejection) for p in plants]),
         water_l_per_kw=_array([p.facility.litres_per_kw for p in plants]),
         trim_w=1e3 * _array([p.facility.trim_kw for p in plants]),
+        trim_by_plant=_array([p.facility.trim_by == "plant" for p in plants]),
         reuse_kind=_array([REUSE_KINDS.index(p.reuse.kind) for p in plants]),
         reuse_share=_array([p.reuse.share for p in plants]),
         heat_price_per_kwh=_array([p.reuse.price_per_kwh_heat for p in plants]),

@@ -11,7 +11,9 @@ import numpy.typing as npt
 
 from sdc_taichi.config.odd_values import odd_w_class, warn_of
 from sdc_taichi.hall.protection import TRIPPED
+from sdc_taichi.plant.water_side import chilled_water_c
 from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Hall
 from sdc_taichi.sim.hall_state import HallSums
@@ -80,6 +82,9 @@ class LiquidStep:
     """Started work that limited GPUs did not complete, in tasks, (B,)."""
     state: dict[str, F64]
     """Fields of ``State`` at the end of the step."""
+    to_plant_w: F64 | None
+    """Heat that the plants of the CRAC units take from facility water, in W, (B,); None if no plant
+    takes any."""
     without_room_tasks: F64
     """Part of ``throttled_tasks`` for which the queue has no room, in tasks, (B,)."""
 
@@ -121,17 +126,20 @@ class LiquidHalls:
         self._pump_share = np.array(
             [s.cdus.pump_share if s.cdus.pumps > 1 else 0.0 for s in sections if s is not None]
         ).repeat(np.diff(fleet.cdu_offsets)[[s is not None for s in sections]])
+        self._water_side = sizing.water_side
+        self._has_plants = bool(self._model.by_plant.any())
         hall.take_heat_of(self._racks)
         weather = zip(fleet.configs, sizing.design_outdoor_c, sizing.design_wet_bulb_c, strict=True)
         odd = [(c.name, odd_w_class(c, float(dry), float(wet))) for c, dry, wet in weather]
         warn_of([(name, [text]) for name, text in odd if text is not None])
 
-    def initial(self, surroundings_c: tuple[F64, F64], load: F64) -> dict[str, F64]:
+    def initial(self, surroundings_c: tuple[F64, F64], load: F64, supply: Supply) -> dict[str, F64]:
         """Return the fields of ``State`` before the first step; give transient halls the heat.
 
         Args:
             surroundings_c: Outdoor dry bulb and wet bulb, in C, (B,) each.
             load: Utilisation of each rack, 0..1, (R,).
+            supply: Operation of the CRAC units before the first step.
         """
         outdoor_c, wet_bulb_c = surroundings_c
         state = self._model.initial_state(
@@ -141,6 +149,7 @@ class LiquidHalls:
                 outdoor_c=outdoor_c,
                 wet_bulb_c=wet_bulb_c,
                 dew_point_c=self._dew_point.at(outdoor_c, wet_bulb_c),
+                chilled_water_c=self._chilled_water_c(supply),
             )
         )
         if self._transient:
@@ -148,7 +157,12 @@ class LiquidHalls:
         return self._kept(state)
 
     def step(
-        self, state: State, commands: Commands, surroundings: Surroundings, placement: Placement
+        self,
+        state: State,
+        commands: Commands,
+        surroundings: Surroundings,
+        placement: Placement,
+        supply: Supply,
     ) -> LiquidStep:
         """Compute a step, and tell the halls the heat in their air.
 
@@ -157,6 +171,7 @@ class LiquidHalls:
             commands: Commands of the step.
             surroundings: Weather and failures of the step.
             placement: Placement of the work.
+            supply: Operation of the CRAC units.
         """
         on = self._all_on
         if placement.rack_powered is not None:
@@ -183,6 +198,7 @@ class LiquidHalls:
                 facility_approach_k=commands.facility_approach_k,
                 reuse_share=commands.reuse_share,
                 power_cap=commands.power_cap,
+                chilled_water_c=self._chilled_water_c(supply),
                 **failures,
             ),
         )
@@ -282,8 +298,15 @@ class LiquidHalls:
             without_coolant=without_coolant,
             throttled_tasks=throttled,
             state=self._kept(after),
+            to_plant_w=values["liquid_to_plant_w"] if self._has_plants else None,
             without_room_tasks=np.zeros(size),
         )
+
+    def _chilled_water_c(self, supply: Supply) -> F64 | None:
+        """Return the chilled water of plants that cool facility water, in C, (B,)."""
+        if not self._has_plants:
+            return None
+        return chilled_water_c(supply.water_setpoint_c, self._water_side)
 
     def _kept(self, state: LiquidState) -> dict[str, F64]:
         """Return the fields of ``State``, of which quasi-steady halls need setpoints and flows."""
@@ -307,6 +330,9 @@ class LiquidHalls:
     def _failures(self, surroundings: Surroundings) -> dict[str, Any]:
         """Return the failures as arguments of ``LiquidInputs``."""
         failures: dict[str, Any] = {"leak_l": surroundings.leaked_l}
+        if self._has_plants:
+            plant = surroundings.chiller_share * surroundings.pump_share
+            failures["plant_share"] = np.where(surroundings.powered > 0.0, plant, 0.0)
         if surroundings.cdu_up is None and surroundings.fully_powered:
             return failures
         size, fleet = self._fleet.size, self._fleet

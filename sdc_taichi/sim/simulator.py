@@ -225,11 +225,17 @@ class Simulator:
         supply = stages.crac_units.supply(state, commands, surroundings)
         liquid = None
         if stages.liquid is not None:
-            liquid = stages.liquid.step(state, commands, surroundings, placement)
+            liquid = stages.liquid.step(state, commands, surroundings, placement, supply)
             work, liquid.without_room_tasks = stages.workload.put_back(work, liquid.throttled_tasks)
         self._liquid = liquid
         try:
-            air, thermal = stages.air.solve(state, placement, supply, surroundings)
+            air, thermal = stages.air.solve(
+                state,
+                placement,
+                supply,
+                surroundings,
+                None if liquid is None else liquid.to_plant_w,
+            )
         except PhysicalLimitError as error:
             raise PhysicalLimitError(f"{error} (step {state.step})") from None
         plant = stages.facility.step(state, commands, surroundings, supply, air, liquid)

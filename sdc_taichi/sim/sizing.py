@@ -154,15 +154,16 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     full = _solve(fleet, hall, v("hall.design_supply_c"), np.ones(fleet.size))
     it_w = air_w = full.cpu_w + full.it_fan_w
     liquid_overhead_w: F64 | float = 0.0
+    facility_water_w = np.zeros(fleet.size)
     if fleet.liquid is not None:
         liquid = liquid_design(fleet.liquid)
         it_w, air_w = air_w + liquid.liquid_w, air_w + liquid.to_air_w
-        liquid_overhead_w = liquid.overhead_w
+        liquid_overhead_w, facility_water_w = liquid.overhead_w, liquid.to_plant_w
     crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
     # With spare units, all units run at part speed.
     crac_at_design_w = crac_fan_w * fleet.design_speed**3
-    cooling_w = (air_w + crac_at_design_w) * v("hvac.sizing.margin")
+    cooling_w = (air_w + crac_at_design_w) * v("hvac.sizing.margin") + facility_water_w
     pump_heat_w = v("hvac.pumps.heat_to_water_share") * _chilled_pump_w(fleet, cooling_w)
     chiller_w, at_design, fullest_c = _design_chiller(
         fleet, cooling_w + pump_heat_w, outdoor_c, wet_bulb_c
@@ -170,7 +171,12 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     water_side = _water_side(
         fleet, cooling_w, chiller_w, at_design.rejected_w, crac_flow_m3s, outdoor_c, wet_bulb_c
     )
-    water_side = replace(water_side, fullest_condenser_c=fullest_c)
+    water_side = replace(
+        water_side,
+        fullest_condenser_c=fullest_c,
+        facility_water_w=facility_water_w,
+        coil_rise_k=(cooling_w - facility_water_w) / (air_j_per_m3_k(fleet) * crac_flow_m3s),
+    )
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = (
         it_w

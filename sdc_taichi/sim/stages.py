@@ -76,7 +76,7 @@ class Stages:
         if self.liquid is not None:
             weather = drivers.at(0)
             each = demand[fleet.rack_dc] if rack_load is None else rack_load
-            liquid = self.liquid.initial((weather.outdoor_c, weather.wet_bulb_c), each)
+            liquid = self.liquid.initial((weather.outdoor_c, weather.wet_bulb_c), each, supply)
         return State(
             step=0,
             seed=seeds,
@@ -275,7 +275,9 @@ class SteadyFacility:
             self._state, self._commands, surroundings, work, capacity
         )
         if stages.liquid is not None:
-            self._liquid = stages.liquid.step(self._state, self._commands, surroundings, placement)
+            self._liquid = stages.liquid.step(
+                self._state, self._commands, surroundings, placement, self._supply
+            )
         air, _ = stages.air.solve(self._state, placement, self._supply, surroundings)
         return air
 
