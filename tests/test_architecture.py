@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,6 +63,18 @@ def source_files() -> dict[str, Path]:
 FILES = source_files()
 
 
+@functools.cache
+def nodes(module: str) -> list[ast.AST]:
+    """All nodes of the syntax tree of a module, the tree itself first."""
+    return list(ast.walk(ast.parse(FILES[module].read_text(encoding="utf-8"))))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nodes_are_forgotten() -> Iterator[None]:
+    yield
+    nodes.cache_clear()
+
+
 def module_of(name: str) -> str:
     """The module that ``name``, a dotted path below ``sdc_taichi``, names or lies in."""
     parts = name.split(".") if name else []
@@ -73,11 +86,12 @@ def module_of(name: str) -> str:
     raise AssertionError(f"{name}: no module of the package")
 
 
-def imported(module: str) -> set[str]:
+@functools.cache
+def imported(module: str) -> frozenset[str]:
     """Modules of the package that a module imports anywhere, in functions and for types too."""
     package = module.split(".")[:-1]
-    found = set()
-    for node in ast.walk(ast.parse(FILES[module].read_text(encoding="utf-8"))):
+    found: set[str] = set()
+    for node in nodes(module):
         if isinstance(node, ast.Import):
             names = [a.name for a in node.names if a.name.split(".")[0] == "sdc_taichi"]
             found |= {module_of(name.partition(".")[2]) for name in names}
@@ -91,7 +105,7 @@ def imported(module: str) -> set[str]:
                 continue
             stem = ".".join(parts)
             found |= {module_of(f"{stem}.{a.name}".strip(".")) for a in node.names}
-    return found - {module}
+    return frozenset(found - {module})
 
 
 def room_of(module: str) -> str:
@@ -105,15 +119,14 @@ def test_there_are_few_rooms_and_each_has_its_place() -> None:
     assert len(rooms - {*MAPPED, "__main__"}) <= 21
 
 
-@pytest.mark.parametrize("module", FILES)
-def test_no_import_runs_upwards(module: str) -> None:
-    room = room_of(module)
-    above = {
-        other
+def test_no_import_runs_upwards() -> None:
+    upwards = {
+        (module, other)
+        for module in FILES
         for other in imported(module)
-        if room_of(other) != room and ROOMS.index(room_of(other)) > ROOMS.index(room)
+        if ROOMS.index(room_of(other)) > ROOMS.index(room_of(module))
     }
-    assert above == set(), f"{module} imports from rooms above {room}"
+    assert upwards == set(), "these modules import from rooms above their own"
 
 
 def test_modules_of_a_room_do_not_import_each_other_in_a_circle() -> None:
@@ -134,22 +147,24 @@ def test_parquet_files_are_read_through_one_function() -> None:
     readers = {"ParquetFile", "ParquetDataset", "iter_batches", "read_row_group", "read_parquet"}
     calls = {
         (room_of(module), called.attr)
-        for module, path in FILES.items()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for module in FILES
+        for node in nodes(module)
         if isinstance(node, ast.Call)
         and isinstance(called := node.func, ast.Attribute)
-        and (called.attr in readers or ast.unparse(called) == "pq.read_table")
+        and (
+            called.attr in readers
+            or (called.attr == "read_table" and ast.unparse(called.value) == "pq")
+        )
     }
     assert calls == {("user_file", "ParquetFile"), ("user_file", "read_row_group")}
 
 
 def test_plant_is_pure_functions() -> None:
-    for module, path in FILES.items():
+    for module in FILES:
         if room_of(module) != "plant":
             continue
         assert {room_of(other) for other in imported(module)} <= {"plant", "types", "errors"}
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
+        for node in nodes(module):
             assert not isinstance(node, ast.Global | ast.Nonlocal), f"{module}:{node.lineno}"
             if isinstance(node, ast.ClassDef):
                 kinds = [ast.unparse(d) for d in node.decorator_list]
@@ -162,15 +177,17 @@ def test_plant_is_pure_functions() -> None:
 
 @pytest.mark.parametrize("module", [m for m in FILES if m.endswith("__init__")])
 def test_each_folder_says_in_three_sentences_what_lives_there(module: str) -> None:
-    said = ast.get_docstring(ast.parse(FILES[module].read_text(encoding="utf-8"))) or ""
+    tree = nodes(module)[0]
+    assert isinstance(tree, ast.Module)
+    said = ast.get_docstring(tree) or ""
     sentences = re.findall(r"[^.]\.(?:\s|$)", said)
     assert len(sentences) >= 3 or module == "__init__", f"{module}: {said!r}"
 
 
 def fields_of_records() -> Iterator[tuple[str, str | None]]:
     """Each public field of a public class that holds data, and its docstring."""
-    for module, path in FILES.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for module in FILES:
+        for node in nodes(module):
             if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
                 continue
             if module.startswith("cli.") and node.name.endswith("Options"):
@@ -191,9 +208,7 @@ def fields_of_records() -> Iterator[tuple[str, str | None]]:
 
 
 def test_every_public_field_has_a_docstring_that_stands_alone() -> None:
-    without = [name for name, said in fields_of_records() if not said]
-    assert without == []
-    leaning = [
-        name for name, said in fields_of_records() if LEANS_ON_ITS_NEIGHBOUR.search(said or "")
-    ]
+    fields = list(fields_of_records())
+    assert [name for name, said in fields if not said] == []
+    leaning = [name for name, said in fields if LEANS_ON_ITS_NEIGHBOUR.search(said or "")]
     assert leaning == []

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -25,16 +26,24 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What one run writes."""
     folder = tmp_path_factory.mktemp("bench")
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "bench.py"), "--quick", "--out", str(folder)],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as out:
+        patch.syspath_prepend(str(BENCHMARKS))
+        patch.setattr(sys, "argv", ["bench.py", "--quick", "--out", str(folder)])
+        bench, fresh = map(importlib.import_module, ("bench", "fresh"))
+        in_new_process = bench.child
+
+        def child(part: str, *arguments: Any, **variables: str) -> Any:
+            """Runs in this process, which has the kernels, what needs no process of its own."""
+            if part == "cycles":
+                return in_new_process(part, *arguments, **variables)
+            return fresh.PARTS[part](*arguments)
+
+        patch.setattr(bench, "child", child)
+        bench.main()
     written = json.loads((folder / "bench.json").read_text(encoding="utf-8"))
     # Every figure is printed as well.
     for figure in written["figures"]:
-        assert figure["name"] in done.stdout
+        assert figure["name"] in out.getvalue()
     return dict(written)
 
 

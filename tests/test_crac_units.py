@@ -279,10 +279,8 @@ RESTART = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.1, duration_h
 @pytest.mark.parametrize(
     ("units", "spare_units", "flow_model"),
     [
-        (1, 0, "follow_servers"), (2, 1, "follow_servers"), (4, 0, "follow_servers"),
-        (4, 1, "follow_servers"), (6, 2, "follow_servers"), (4, 0, "pressure"),
-        (4, 1, "pressure"), (2, 1, "constant"), (4, 1, "constant"), (4, 1, "controlled"),
-        (4, 0, "hottest_inlet"), (4, 1, "hottest_inlet"),
+        (1, 0, "follow_servers"), (4, 0, "follow_servers"), (4, 1, "follow_servers"),
+        (4, 0, "pressure"), (2, 1, "constant"), (4, 1, "controlled"), (4, 1, "hottest_inlet"),
     ],
 )  # fmt: skip
 def test_a_unit_that_restarts_cools_the_hall_at_once(
@@ -293,7 +291,7 @@ def test_a_unit_that_restarts_cools_the_hall_at_once(
         _, results = run_at_full_load(
             f"hvac.crac.units={units}", f"hvac.crac.spare_units={spare_units}",
             f"hvac.crac.flow_model={flow_model}", f"simulation.substep_s={substep_s}",
-            *MINUTES, RESTART, steps=60,
+            *MINUTES, RESTART, steps=46,
         )  # fmt: skip
         hottest[substep_s] = np.array([r.inlet_max_c[0] for r in results])
     # The last minute without the unit is minute 41; its casing holds a third of a second of air.
