@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import json
 import logging
+import re
 import zipfile
 from collections.abc import Callable, Iterator
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
+import service_answers
 from exogenous_builders import epw_lines, text
 from faulty_server import Answer, sends, serving
 from sdc_taichi.cli.app import app
@@ -364,10 +366,19 @@ def test_odd_rows_are_noted(run: Callable[..., Result]) -> None:
         (lambda rows: rows[3].pop("fueltype"), "row 4, column fueltype"),
     ],
 )
-def test_wrong_rows_are_one_line(
-    run: Callable[..., Result], change: Callable[[list[dict[str, Any]]], object], message: str
+def test_wrong_rows_are_told(
+    change: Callable[[list[dict[str, Any]]], object], message: str
 ) -> None:
-    assert message in error(run(eia(change), *EIA))
+    rows = service_answers.eia_rows(datetime(2023, 1, 1), datetime(2023, 1, 1, 23))
+    change(rows)
+    period = Period(date(2023, 1, 1), date(2023, 1, 2))
+    with pytest.raises(DataError, match=re.escape(message)):
+        read_generation(services()["eia-930"], period, eia_document(rows, {}), "url")
+
+
+def test_a_wrong_row_is_one_line_of_the_command(run: Callable[..., Result]) -> None:
+    line = error(run(eia(lambda rows: rows[3].update(value="many")), *EIA))
+    assert "row 4, column value: 'many'" in line
 
 
 def test_rows_that_the_service_leaves_out_are_an_error() -> None:

@@ -17,9 +17,12 @@ from typer.testing import CliRunner
 
 import made_studies
 from exogenous_builders import carbon_lines, epw_lines, text, workload_lines
+from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.cli.app import app
+from sdc_taichi.cli.jobs import JobOptions
 from sdc_taichi.control import registry
 from sdc_taichi.envs import costs, rewards
+from sdc_taichi.viz import report
 
 pytestmark = pytest.mark.repo
 
@@ -48,6 +51,8 @@ PAGES = [
 POLICY = ROOT / "tests" / "reference" / "benchmark" / "carbon" / "ippo"
 NOT_RUN = ("train", "evaluate", "benchmark")
 """Commands that take long or need an extra: it is seen that they are valid."""
+DRAWN = ("fleet_section", "data_center_section", "hot_racks_section", "inputs_section")
+"""Sections of reports that take seconds to draw; tests/test_report.py holds what they show."""
 SHOWN = ("train",)
 """Those of them that check all values if they are to show them, and are not resumed."""
 _NOT_RUN_MARK = re.compile(r"<!-- not run: .+ -->\s*\Z")
@@ -96,6 +101,10 @@ def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module in (costs, rewards):
         monkeypatch.setattr(module, "_registered", {})
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
+    for section in DRAWN:
+        monkeypatch.setattr(report, section, lambda *_, **__: [])
+    # Processes of their own would compile kernels again.
+    monkeypatch.setattr(JobOptions, "executor", lambda _: Executor())
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDC_TAICHI_DATA", str(tmp_path / "data"))
     Path("station.epw").write_text(text(epw_lines()))
@@ -121,7 +130,7 @@ def test_what_a_guide_shows_runs(
 
 def run(line: str) -> None:
     """Run a command line, or see that it is valid."""
-    program, *words = shlex.split(line)
+    program, *words = shlex.split(re.sub(r"--days \d+", "--days 1", line))
     if program == "pip":
         return
     assert program == "sdc-taichi", line
@@ -215,7 +224,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(POLICY, folder / "runs" / "happo")
     made_studies.write_study(folder / "results")
     command = ["sweep", "tiny", "--vary", "hvac.setpoint.initial_c=16:17:1", "--days", "1"]
-    command += ["--jobs", "1", "--out", str(folder / "sweeps" / "setpoints"), "--quiet"]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    command += ["--out", str(folder / "sweeps" / "setpoints"), "--quiet"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(JobOptions, "executor", lambda _: Executor())
+        assert CliRunner().invoke(app, command).exit_code == 0
     (folder / "evaluation").mkdir()
     return folder
