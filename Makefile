@@ -28,7 +28,14 @@ TORCH ?= torch==2.13.0
 PYTHON ?= python3.13 python3.12 python3.11 python3 python
 
 # A file stays with one process, because its fixtures are shared; each process may take 1 GB.
-SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
+# tests/conftest.py puts the files that take longest first.
+SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Tests of what libraries do: files, tables, pictures, environments, command line, kernels, optima,
+# and reference results. What the others compute takes the same functions of NumPy and Taichi.
+OF_LIBRARIES := cli column_maps compat config doctor drivers envs exogenous export fetch figures geo \
+    golden jobs kernels launch malformed matrix named_kernel optimum_solve policy public_api \
+    rack_history readme recorder reference report result_table runtime saved simulator stage \
+    statistics streams submissions sweep user_file
 TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py \
     tests/test_ray*.py tests/test_offline*.py tests/test_user_functions.py)
 TYPED := build/typecheck
@@ -47,10 +54,11 @@ test: $(READY) ## Run the tests that need neither PyTorch, Ray nor Minari; measu
 	$(PY) -m pytest $(SPREAD)
 
 # Old libraries warn of what changed in their own dependencies since.
-test-oldest: $(READY_OLDEST) ## Run all tests with Python 3.11 and the oldest libraries that are supported.
-	$(OLDEST)/bin/python -m pytest $(SPREAD) -W ignore::DeprecationWarning
+test-oldest: $(READY_OLDEST) ## Run tests of libraries with Python 3.11 and the oldest that are supported.
+	$(OLDEST)/bin/python -m pytest $(SPREAD) -W ignore::DeprecationWarning \
+	    $(foreach part,$(OF_LIBRARIES),$(wildcard tests/test_$(part)*.py))
 
-test-processors: $(READY) ## Run tests of results as on older processors, and with one thread.
+test-processors: $(READY) ## Run tests of results as on older processors.
 	$(PY) tests/other_processors.py $(SPREAD)
 
 test-train: $(READY_TRAIN) ## Install PyTorch, Ray and Minari, and run the tests of training, jobs on Ray and data sets.

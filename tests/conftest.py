@@ -20,6 +20,19 @@ hypothesis.settings.load_profile("reproducible")
 hypothesis.settings.register_profile("others", deadline=None)
 
 
+LONGEST = (
+    "guides", "envs_api", "hall_events", "ledgers", "cli", "optimum_solve", "kernels", "bench",
+    "hall_commands", "viewer",
+)  # fmt: skip
+"""Test files that take longest. One that begins last would leave the other processes idle."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first."""
+    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Folder of measured weather, carbon and workload files, named by SDC_REAL_DATA."""

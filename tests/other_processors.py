@@ -63,11 +63,7 @@ class _StringRef(ctypes.Structure):
 
 def settings() -> dict[str, dict[str, str] | str]:
     """Environment variables of each setting by its name, or why it cannot be had."""
-    found: dict[str, dict[str, str] | str] = {level: _level(level) for level in LEVELS}
-    found["one thread"] = {
-        name: "1" for name in ("SDC_TAICHI_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
-    }
-    return found
+    return {level: _level(level) for level in LEVELS}
 
 
 def _level(level: str) -> dict[str, str] | str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -38,6 +39,8 @@ PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 SEASONS: dict[Precision, tuple[str, ...]] = {"f64": MONTHS, "f32": MONTHS[::3]}
 STEPS: dict[Precision, int] = {"f64": MONTH_STEPS, "f32": MONTH_STEPS // 3}
 """Rounding in f32 shows in a third of a month of each season as well as in all twelve."""
+TRANSIENT_STEPS = MONTH_STEPS // 3
+"""Ten days of the months fill and empty what has thermal mass many times."""
 THERMAL = ("quasi_steady", "transient")
 
 
@@ -145,10 +148,10 @@ def year(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
 
 @pytest.fixture(scope="module", params=PRECISIONS)
 def transient_year(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
-    """The same with thermal mass."""
+    """The same with thermal mass, in ten days of the months."""
     overrides = ["simulation.thermal=transient"]
     configs = sites_and_seasons(overrides, SITES, SEASONS[request.param])
-    return request.param, record(configs, STEPS[request.param], None, request.param)
+    return request.param, record(configs, TRANSIENT_STEPS, None, request.param)
 
 
 def troubled(thermal: str) -> tuple[list[DataCenterConfig], int, Drivers]:
@@ -189,16 +192,26 @@ def troubled(thermal: str) -> tuple[list[DataCenterConfig], int, Drivers]:
     return make_configs(base, count=size), steps, drivers
 
 
+@cache
+def run_of_trouble(thermal: str, precision: Precision) -> Run:
+    return record(*troubled(thermal), precision)
+
+
 @pytest.fixture(scope="module", params=[(p, t) for p in PRECISIONS for t in THERMAL])
 def trouble(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
     """Halls in trouble, steady and transient."""
     precision, thermal = request.param
-    return precision, record(*troubled(thermal), precision)
+    return precision, run_of_trouble(thermal, precision)
 
 
 @pytest.fixture(scope="module", params=PRECISIONS)
 def heat_wave(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
     """Plants too small for hot afternoons at full load: heat stays in the room and leaves later."""
+    return request.param, run_of_heat_wave(request.param)
+
+
+@cache
+def run_of_heat_wave(precision: Precision) -> Run:
     rng = np.random.default_rng(1)
     steps, size = 960, 6
     hour = np.arange(steps) / 4.0 % 24.0
@@ -219,13 +232,13 @@ def heat_wave(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
             "workload.queue_limit_h=1",
         ],
     )
-    return request.param, record(make_configs(base, count=size), steps, drivers, request.param)
+    return record(make_configs(base, count=size), steps, drivers, precision)
 
 
 @pytest.fixture(scope="module")
 def failed() -> Run:
     """Transient halls in trouble, f64."""
-    return record(*troubled("transient"), "f64")
+    return run_of_trouble("transient", "f64")
 
 
 def assert_closes(name: str, run: Run, tolerance: float, floor: float = 0.0) -> None:
@@ -261,7 +274,7 @@ def test_ledger_closes_on_every_step_of_the_transient_year(
     name: str, transient_year: tuple[Precision, Run]
 ) -> None:
     precision, run = transient_year
-    assert run["it_w"].shape == (STEPS[precision], len(SITES) * len(SEASONS[precision]))
+    assert run["it_w"].shape == (TRANSIENT_STEPS, len(SITES) * len(SEASONS[precision]))
     assert_closes(name, run, TOLERANCE[precision])
 
 

@@ -123,12 +123,10 @@ def test_cost_follows_prices_and_shaves_the_peak_of_the_month() -> None:
 @pytest.mark.parametrize(
     "overrides",
     [
-        (),
         ("workload.flexible_share=0.6", "workload.queue_limit_h=0.5"),
         ("workload.flexible_share=0.6", "workload.deadline_h=2", "workload.max_utilisation=0.7"),
-        ("workload.model=tasks", "battery.model=released"),
-        ("hvac.setpoint.model=accelerating", "battery.model=paper"),
-        ("protection.ashrae_class=A1", "hvac.setpoint.initial_c=23"),
+        ("workload.model=tasks", "battery.model=released", "hvac.setpoint.model=accelerating"),
+        ("protection.ashrae_class=A1", "hvac.setpoint.initial_c=23", "battery.model=paper"),
         ("electrical.grid_limit_ratio=1.0",),
     ],
 )

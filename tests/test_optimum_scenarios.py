@@ -77,7 +77,7 @@ def moves_slowly(config: DataCenterConfig, name: str) -> bool:
     return name != "warmest" or setpoint.max_c - setpoint.initial_c <= RAMP_K
 
 
-@settings(max_examples=5, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=3, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
 @given(draw=st.randoms(use_true_random=False))
 def test_bound_achieved_figure_and_controllers_are_in_order(draw: random.Random) -> None:
     models = draw_models(draw)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -36,18 +37,22 @@ SETPOINTS = ["reset", "approach"]
 WATER_COOLED = ["centrifugal_vsd", "carnot", "eir_york", "electric_water_cooled", "constant_cop"]
 
 
-@pytest.mark.parametrize("economiser", ["true", "false"])
 @pytest.mark.parametrize("model", WATER_COOLED)
-def test_full_load_is_removed_in_any_weather(model: str, economiser: str) -> None:
+def test_full_load_is_removed_in_any_weather(model: str) -> None:
     base = load_config(
         "corrected",
-        [f"hvac.chiller.model={model}", f"hvac.tower.economiser={economiser}",
-         "hvac.sizing.design_wet_bulb_c=26", "hvac.sizing.design_outdoor_c=33",
-         "workload.max_utilisation=1"],
+        [f"hvac.chiller.model={model}", "hvac.sizing.design_wet_bulb_c=26",
+         "hvac.sizing.design_outdoor_c=33", "workload.max_utilisation=1"],
     )  # fmt: skip
     weather = [(-20.0, 16), (-10.0, 18), (-10.0, 23), (5.0, 20), (15.0, 16), (26.0, 16), (26.0, 23)]
-    configs = [apply_overrides(base, [f"hvac.setpoint.initial_c={c}"]) for _, c in weather]
-    wet_bulb_c = np.array([[wet_bulb_c] for wet_bulb_c, _ in weather])
+    configs = [
+        apply_overrides(
+            base, [f"hvac.setpoint.initial_c={c}", f"hvac.tower.economiser={economiser}"]
+        )
+        for economiser in ("true", "false")
+        for _, c in weather
+    ]
+    wet_bulb_c = np.array([[wet_bulb_c] for wet_bulb_c, _ in 2 * weather])
     full = np.ones_like(wet_bulb_c)
     with Simulator(
         configs, drivers=drivers_from_arrays(wet_bulb_c + 5.0, wet_bulb_c, 300.0 * full, full)
@@ -352,10 +357,19 @@ SWEEPS = {
 }
 STARTS = [
     Swept(load, setpoint_c, outdoor_c, depression_k)
-    for load in (0.6, 0.75, 0.95)
+    for load in (0.6, 0.95)
     for setpoint_c in (14.0, 18.0, 24.0)
     for outdoor_c, depression_k in ((-8.0, 1.0), (6.0, 2.0), (13.0, 3.0), (19.0, 6.0), (26.0, 9.0))
 ]
+
+
+def sweeps(every: int = 1) -> Iterator[tuple[str, F64, Swept, Swept]]:
+    """Yield each different sweep: its name, what is swept, where it starts and the conditions."""
+    for sweep, (field, all_values) in SWEEPS.items():
+        values = all_values[::every]
+        starts = {start._replace(**{field: 0.0}): start for start in STARTS}
+        for start in starts.values():
+            yield sweep, values, start, start._replace(**{field: values})
 
 
 @cache
@@ -418,29 +432,25 @@ def dampers_move(names: tuple[str, str, str], at: Swept) -> Any:
 )  # fmt: skip
 def test_power_of_plants_has_no_jumps(names: tuple[str, str, str], outdoor_units: float) -> None:
     jumps = []
-    for sweep, (field, values) in SWEEPS.items():
-        for start in STARTS:
-            at = start._replace(**{field: values})
-            power_w = hvac_w(names, at, outdoor_units=outdoor_units)
-            steps = np.abs(np.diff(power_w)) / power_w[1:]
-            over = steps - np.where(dampers_move(names, at)[1:], LARGEST_JUMP_OF_DAMPERS,
-                                    LARGEST_JUMP)  # fmt: skip
-            if np.nanmax(over, initial=0.0) > 0.0:
-                i = int(np.nanargmax(over))
-                jumps.append(f"{sweep} {values[i]:.4f}, {start}: {steps[i]:.2%} of HVAC")
+    for sweep, values, start, at in sweeps():
+        power_w = hvac_w(names, at, outdoor_units=outdoor_units)
+        steps = np.abs(np.diff(power_w)) / power_w[1:]
+        over = steps - np.where(dampers_move(names, at)[1:], LARGEST_JUMP_OF_DAMPERS,
+                                LARGEST_JUMP)  # fmt: skip
+        if np.nanmax(over, initial=0.0) > 0.0:
+            i = int(np.nanargmax(over))
+            jumps.append(f"{sweep} {values[i]:.4f}, {start}: {steps[i]:.2%} of HVAC")
     assert not jumps, "\n".join(jumps)
 
 
 @pytest.mark.parametrize("names", SWEPT, ids="-".join)
 def test_free_cooling_never_costs_more_than_none(names: tuple[str, str, str]) -> None:
     more = []
-    for sweep, (field, values) in SWEEPS.items():
-        for start in STARTS:
-            at = start._replace(**{field: values[::25]})
-            ratio = hvac_w(names, at) / hvac_w(names, at, free=False) - 1.0
-            if np.nanmax(ratio, initial=0.0) > 1e-9:
-                i = int(np.nanargmax(ratio))
-                more.append(f"{sweep} {values[25 * i]:.3f}, {start}: {ratio[i]:+.2%}")
+    for sweep, values, start, at in sweeps(every=25):
+        ratio = hvac_w(names, at) / hvac_w(names, at, free=False) - 1.0
+        if np.nanmax(ratio, initial=0.0) > 1e-9:
+            i = int(np.nanargmax(ratio))
+            more.append(f"{sweep} {values[i]:.3f}, {start}: {ratio[i]:+.2%}")
     assert not more, "\n".join(more)
 
 
