@@ -57,7 +57,7 @@ from sdc_taichi.types import F64, ServerLayers
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=6)
+@settings(phases=AS_FOUND, max_examples=4)
 @given(seed=SEEDS)
 def test_steady_halls_agree_with_the_twin(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
@@ -65,12 +65,12 @@ def test_steady_halls_agree_with_the_twin(precision: Precision, seed: int) -> No
     assert_agrees(configs, met, precision)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("kind", [0, 1, 2], ids=["mean load", "rack loads", "group loads"])
+@pytest.mark.parametrize(("kind", "precision"), [(0, "f32"), (1, "f64"), (2, "f64")])
 @pytest.mark.parametrize("shape", [(4, 5), *MERGED[:1], *LONG])
 def test_every_kind_of_exchange_and_load_agrees_with_the_twin(
     shape: tuple[int, int], kind: int, precision: Precision
 ) -> None:
+    """Kinds are mean loads, loads of racks and loads of groups."""
     rng = np.random.default_rng(shape[1] + kind)
     config = random_hall(rng, "dc", shape)
     assert_agrees([config], random_conditions(rng, [config], kind=kind), precision)
@@ -350,7 +350,7 @@ def leaving(part: Part, sums: HallSums, layers: ServerLayers) -> tuple[float, fl
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=6)
+@settings(phases=AS_FOUND, max_examples=4)
 @given(seed=SEEDS)
 def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
