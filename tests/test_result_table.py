@@ -98,7 +98,7 @@ TEXTS = {
 }
 FORGERIES = [
     *((name, "cost", forge) for name, forge in NUMBERS.items()),
-    *((name, "idle_figure", forge) for name, forge in NUMBERS.items()),
+    *((name, "idle_figure", NUMBERS[name]) for name in ("nan", "text", "missing")),
     *((name, "week", forge) for name, forge in NUMBERS.items()),
     ("half", "week", column(3.5)),
     ("boolean", "share", column(True)),

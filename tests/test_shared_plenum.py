@@ -444,8 +444,7 @@ def test_more_air_of_one_unit_cools_its_racks() -> None:
         assert change_k[near].mean() < 1.4 * change_k[far].mean() < 0.0
 
 
-@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
-@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize(("thermal", "precision"), [("quasi_steady", "f64"), ("transient", "f32")])
 def test_plain_halls_keep_their_bits_beside_halls_with_coupled_units(
     thermal: str, precision: Any
 ) -> None:
