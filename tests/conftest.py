@@ -21,8 +21,8 @@ hypothesis.settings.register_profile("others", deadline=None)
 
 
 LONGEST = (
-    "plants", "guides", "report", "envs_api", "hall_events", "ledgers", "cli", "recirculation",
-    "optimum_solve", "transients", "kernels", "bench", "hall_commands", "viewer",
+    "stage", "plants", "guides", "report", "simulator", "envs_api", "hall_events", "ledgers", "cli",
+    "recirculation", "optimum_solve", "transients", "kernels", "bench", "hall_commands", "viewer",
 )  # fmt: skip
 """Test files that take longest. One that begins last would leave the other processes idle."""
 

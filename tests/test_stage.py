@@ -192,26 +192,45 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     }
 
 
-@pytest.mark.parametrize("event_free", [True, False])
+# Every chiller, and every other choice of models beside one of them: each kernel takes seconds to
+# compile.
+FACILITIES = {
+    "centrifugal_vsd": [],
+    "carnot": ["simulation.thermal=transient"],
+    "eir_york": ["hvac.crac.capacity_kw=650", "hvac.total_of=[chiller,crac_fan]"],
+    "electric_water_cooled": [
+        "hvac.water.model=paper", "battery.model=paper", "hvac.chiller.coil_valves=false"
+    ],
+    "electric_air_cooled": ["hvac.plant=air_side"],
+    "eir_air_cooled": ["hall.inlet_model=approach", "hvac.crac.flow_model=controlled"],
+    "constant_cop": [
+        "hvac.water.model=mass_balance", "hvac.tower.economiser=false",
+        "hall.inlet_model=approach", "hvac.crac.flow_model=constant",
+    ],
+}  # fmt: skip
+OF_PRESETS = {"sustaindc": "released", "paper": "paper"}
+
+
+def test_facilities_have_every_chiller() -> None:
+    assert {*FACILITIES, *OF_PRESETS.values()} == {*CHILLERS}
+    for preset, chiller in OF_PRESETS.items():
+        assert load_config(preset).hvac.chiller_in_use == chiller
+
+
 @pytest.mark.parametrize(
-    "overrides",
+    ("preset", "given", "event_free"),
     [
-        *([f"hvac.chiller.model={name}"] for name in CHILLERS),
-        ["simulation.thermal=transient"],
-        ["hvac.crac.capacity_kw=650", "hvac.total_of=[chiller,crac_fan]"],
-        ["hvac.water.model=paper", "battery.model=paper", "hvac.chiller.coil_valves=false"],
-        ["hvac.chiller.model=electric_air_cooled", "hvac.plant=air_side"],
-        ["hvac.water.model=mass_balance", "hvac.tower.economiser=false"],
-        ["hall.inlet_model=approach"],
-        ["hall.inlet_model=approach", "hvac.crac.flow_model=controlled"],
-        ["hall.inlet_model=approach", "hvac.crac.flow_model=constant"],
-        "sustaindc",
-        "paper",
+        *(
+            ("corrected", [f"hvac.chiller.model={name}", *values], i % 2 == 0)
+            for i, (name, values) in enumerate(FACILITIES.items())
+        ),
+        ("corrected", ["simulation.thermal=transient"], True),
+        ("sustaindc", [], False),
+        ("paper", [], True),
     ],
     ids=str,
 )
-def test_facility_as_in_numpy(overrides: list[str] | str, event_free: bool) -> None:
-    preset, given = (overrides, []) if isinstance(overrides, str) else ("corrected", overrides)
+def test_facility_as_in_numpy(preset: str, given: list[str], event_free: bool) -> None:
     rng, n = np.random.default_rng(7), 200
     year = [20.0, 30.0], [15.0, 20.0], [300.0, 200.0], [0.5, 0.6]
     drivers = drivers_from_arrays(*([column] * n for column in year))
