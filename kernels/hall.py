@@ -57,8 +57,11 @@ from .hall_arguments import (
 from .mixes import (
     ALIKE,
     add_feedback,
+    add_spread_of_units,
     advance_parcels,
     exchange_dense,
+    guess_supply_c,
+    guesses_by_unit,
     look_up_steady_state,
     next_mix,
     set_mode_amounts,
@@ -172,6 +175,8 @@ def update_mixes(
         while block_at < hall.chunks[chunk_at + 1].first_block:
             hall.blocks[block_at].mixed_c = next_mix(hall, n, block_at, sweep, amounts)
             block_at += hall.one
+        if sweep.is_first and guesses_by_unit(hall, n):
+            add_spread_of_units(hall, n, chunk_at, sweep.reference_c)
 
 
 @ti.func
@@ -468,12 +473,13 @@ def run_task(hall: ti.template(), slice_at, first_chunk, end_chunk):
         if begins and dc.sweep == 0 and dc.coupling > 0.0:
             weigh_units(hall, n, True)
     exchanges_after, amounts, terms_at = False, hall.zeros, slice_at * SCRATCH
-    reference_c = ti.cast(hall.units[dc.first_unit].supply_c, hall.real)
+    supply_c = guess_supply_c(hall, n)
+    reference_c = ti.cast(supply_c, hall.real)
     if ti.static(hall.recirculates and not hall.transient):
         exchanges_after = dc.first_mix_weight >= 0
         if dc.sweep == 0:
             if exchanges_after:
-                amounts = look_up_steady_state(hall, n)
+                amounts = look_up_steady_state(hall, n, supply_c)
             else:
                 set_mode_amounts(hall, n, slice_at, reference_c)
     servers = server_model(hall, n)

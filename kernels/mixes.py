@@ -39,6 +39,7 @@ from .hall_arguments import (
     SPARSE_BLOCKS,
     SPARSE_LANES,
 )
+from .servers import first_share_at
 from .sums import present_substep_s, store_change_range
 
 EXHAUST_ROW = row_index(RACK_STATE, "exhaust_c")
@@ -80,15 +81,70 @@ def catmull_rom(x):
 
 @ti.func
 @no_type_check
-def look_up_steady_state(hall: ti.template(), n):
+def guess_supply_c(hall: ti.template(), n):
+    """Return the supply air for which mixes are guessed, in C: that of the first unit.
+
+    In halls with liquid-cooled racks it is the mean of all units, see ``add_spread_of_units``.
+    """
+    dc, more_k = hall.dcs[n], ti.cast(0.0, ti.f64)
+    first, at = dc.first_unit, dc.first_unit
+    if guesses_by_unit(hall, n):
+        while at < hall.dcs[n + 1].first_unit:
+            more_k += hall.units[at].supply_c - hall.units[first].supply_c
+            at += hall.one
+        more_k /= ti.cast(at - first, ti.f64)
+    return hall.units[first].supply_c + more_k
+
+
+@ti.func
+@no_type_check
+def guesses_by_unit(hall: ti.template(), n):
+    """Return True if the guess of a data center includes the spread of the supply air."""
+    return hall.dcs[n].first_mix_weight >= 0 and hall.dcs[n].heat_levels > 1
+
+
+@ti.func
+@no_type_check
+def add_spread_of_units(hall: ti.template(), n, chunk_at, reference_c):
+    """Add to the guessed mixes what the units' deviations from the mean supply air change.
+
+    Outlets follow the supply air of their rack, less the share of exhaust in its intake. The
+    feedback of the mixes is summed up as in ``add_feedback``.
+    """
+    dc, block_at = hall.dcs[n], hall.chunks[chunk_at].first_block
+    n_units = hall.dcs[n + 1].first_unit - dc.first_unit
+    while block_at < hall.chunks[chunk_at + 1].first_block:
+        block, over_k = hall.blocks[block_at], hall.zeros
+        share_0, unit = first_share_at(hall, n, block_at), 0
+        while unit < n_units:
+            supply_c = ti.cast(hall.units[dc.first_unit + unit].supply_c, hall.real)
+            over_k += hall.unit_shares[share_0 + unit] * (supply_c - reference_c)
+            unit += hall.one
+        over_k *= hall.real(1.0) - block.exhaust_share
+        block.mix_input_k = over_k * block.strength
+        block_at += hall.one
+    gain = ti.min(dc.feedback_gain, MOST_GAIN_EXPECTED)
+    with_feedback = ti.cast(1.0 / (1.0 - gain), hall.real)
+    block_at = hall.chunks[chunk_at].first_block
+    while block_at < hall.chunks[chunk_at + 1].first_block:
+        block = hall.blocks[block_at]
+        block.mixed_c = block.mixed_c + dense_mix_of_inputs(hall, n, block_at) * with_feedback
+        block_at += hall.one
+
+
+@ti.func
+@no_type_check
+def look_up_steady_state(hall: ti.template(), n, supply_c):
     """Look up the steady state: return pattern amounts as a vector, and set the feedback gain.
 
-    The table is read at the supply air of the first unit, which approximates the other units well
-    enough for a first guess.
+    Args:
+        hall: arguments of the hall kernel.
+        n: index of the data center.
+        supply_c: supply air of all units, in C.
     """
     dc = hall.dcs[n]
     rows, columns = dc.supply_rows, hall.load_columns
-    y = (hall.units[dc.first_unit].supply_c - dc.table_low_c) * dc.table_rows_per_k
+    y = (supply_c - dc.table_low_c) * dc.table_rows_per_k
     y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
     x = ti.min(ti.max(dc.utilisation, 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
     row = ti.min(ti.cast(y, ti.i32), rows - 2)

@@ -293,6 +293,16 @@ def test_steady_air_is_guessed_with_the_heat_that_coolant_leaves_to_it() -> None
     assert np.max(sweeps) <= 2
 
 
+def test_steady_air_is_guessed_with_a_setpoint_for_each_unit() -> None:
+    config, rng, sweeps = load_config("ai_hall_2026"), np.random.default_rng(0), []
+    with Simulator(config) as sim:
+        sim.reset()
+        for _ in range(24):
+            sim.step(Actions(cooling=rng.integers(-1, 2, sim.fleet.units).astype(float)))
+            sweeps.append(sim.sweeps)
+    assert np.mean(sweeps) < 2.3
+
+
 def test_rear_doors_take_more_heat_from_the_air_the_colder_their_coolant() -> None:
     plain = liquid_hall("plain", liquid={"setpoint_c": 22})
     doors = [
