@@ -98,6 +98,9 @@ def _bind(threads: set[int], count: int) -> None:
 
 CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
 """Environment variable with the path of Taichi's folder of compiled kernels."""
+KERNELS_BYTES = 1_000_000_000
+"""Largest size of the folder. A kernel has some 300 kB, and Taichi's own limit of 100 MB deletes
+kernels of other halls that are still in use."""
 LOCK_S = 60.0
 """Age of the folder's lock file, in s, from which it counts as the remnant of a killed process;
 Taichi holds the lock for milliseconds."""
@@ -317,6 +320,7 @@ def _start_taichi() -> None:
                 arch=ti.cpu,
                 offline_cache=True,
                 offline_cache_file_path=str(folder),
+                offline_cache_max_size_of_files=KERNELS_BYTES,
                 log_level=ti.CRITICAL,
                 cpu_max_num_threads=threads,
             )
