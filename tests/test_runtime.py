@@ -217,7 +217,8 @@ print(*found)
 def test_another_user_of_taichi_may_have_chosen_other_literals() -> None:
     code = (
         "import taichi as ti\n"
-        "ti.init(arch=ti.cpu, default_ip=ti.i64, default_fp=ti.f64, log_level=ti.ERROR)\n"
+        "ti.init(arch=ti.cpu, default_ip=ti.i64, default_fp=ti.f64, log_level=ti.ERROR,"
+        f" offline_cache_max_size_of_files={runtime.KERNELS_BYTES})\n"
         "from sdc_taichi import Simulator, load_config\n"
         "sim = Simulator(load_config('tiny'))\n"
         "sim.reset()\n"
