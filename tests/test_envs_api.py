@@ -42,7 +42,7 @@ SEEN: dict[str, dict[str, Any]] = {
 }
 MODES = ("discrete", "continuous")
 KINDS = [(seen, mode) for seen in SEEN for mode in MODES]
-"""What agents observe and how they act, all pairs; the first is the default."""
+"""Pairs of an observation and a kind of actions; the first pair is the default of environments."""
 EVENTFUL = load_config("corrected", EVENTFUL_HALL)
 BUSY: dict[str, Any] = {
     "config": EVENTFUL,

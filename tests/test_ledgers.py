@@ -148,7 +148,7 @@ def year(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
 
 @pytest.fixture(scope="module", params=PRECISIONS)
 def transient_year(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
-    """The same with thermal mass, in ten days of the months."""
+    """Run of transient halls, over ten days from each of several dates of the year."""
     overrides = ["simulation.thermal=transient"]
     configs = sites_and_seasons(overrides, SITES, SEASONS[request.param])
     return request.param, record(configs, TRANSIENT_STEPS, None, request.param)

@@ -179,7 +179,7 @@ def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_lim
     assert reachable.certificates[0]["hottest_inlet_c"] <= least_c + 1e-3
 
 
-# Of models that tiny, which the other tests take, does not have.
+# These presets have models that preset tiny of the other tests lacks.
 @pytest.mark.parametrize("preset", ["paper", "sustaindc", "hall_of_2026", "ai_hall_2026"])
 def test_presets_have_optima(preset: str) -> None:
     found = solved(config_of("CA", preset=preset), steps=24)

@@ -695,7 +695,8 @@ def test_bad_metrics_are_one_line(folder: Path, tmp_path: Path, place: str) -> N
 def test_bad_files_are_one_line(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
-    if case.startswith("air"):  # It is read after sections that take seconds to draw.
+    # Air files are read after these sections, whose pictures take seconds to draw.
+    if case.startswith("air"):
         for section in ("fleet_section", "data_center_section"):
             monkeypatch.setattr(report, section, lambda *_, **__: [])
     copy = copied(folder, tmp_path)

@@ -164,7 +164,7 @@ def test_transient_halls_agree_with_the_twin(
                 err_msg=f"{configs[i].name} {name}",
             )  # fmt: skip
         for f in fields(reference_twin.Memory):
-            # What racks capture is a small difference of large airflows.
+            # The recirculated air of a rack, in m3/s, is a small difference of large airflows.
             scale = {"room_j": 900.0 * through, "captured_m3s": 1e-3}.get(f.name, 0.0)
             np.testing.assert_allclose(
                 getattr(own, f.name), getattr(left, f.name), rtol=rel, atol=rel * abs(scale) + 1e-9,

@@ -313,10 +313,12 @@ class LiquidFacilityConfig(Section):
     """Concentration of salts in the water of adiabatic coolers and towers divided by that of the
     make-up water, 1.1..100; it defines the blowdown."""
     trim_kw: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Heat that can be removed from what the cooler leaves, in kW, 0..1e6; 0 means none."""
+    """Capacity to remove the heat that the cooler leaves in the water, in kW, 0..1e6; 0 means
+    none."""
     trim_by: Literal["chiller", "plant"] = "chiller"
-    """What removes this heat: a trim chiller of the loop, or, through an exchanger, the chilled
-    water of the plant of the CRAC units, which is sized for it."""
+    """Device with the capacity ``trim_kw``: ``chiller`` is a trim chiller of the facility loop;
+    ``plant`` is an exchanger to the chilled water of the CRAC units, whose plant is sized for the
+    heat of both."""
     w_class: Literal["W17", "W27", "W32", "W40", "W45", "W+"] | None = None
     """ASHRAE TC 9.9 (2021) class of the facility water, which names its highest temperature in C;
     ``W+`` has none. Devices that cannot keep it on the design day raise a warning. None means no

@@ -183,8 +183,9 @@ class Liquid:
         self._is_tower = rejection == _TOWER
         self._trims = bool(np.any(self._per_dc(plants.trim_w) > 0.0))
         self._trim_w, self._trim_cop = self._per_dc(plants.trim_w), self._per_dc(plants.trim_cop)
-        self.by_plant = self._per_dc(plants.trim_by_plant) > 0.0
-        """True for data centers whose plant of the CRAC units cools facility water, (B,)."""
+        self._by_plant = self._per_dc(plants.trim_by_plant) > 0.0
+        self.has_plants = bool(self._by_plant.any())
+        """True if the plant of the CRAC units cools facility water in some data center."""
         cycles = self._per_dc(plants.cycles)
         self._litres_per_w = step_s / EVAPORATION_HEAT_J_PER_KG * cycles / (cycles - 1.0)
         self._income_per_w = self._per_dc(plants.heat_price_per_kwh) * (step_s / 3.6e6)
@@ -317,7 +318,7 @@ class Liquid:
         if self._has_towers:
             air_c = np.where(self._is_tower, inputs.wet_bulb_c + TOWER_APPROACH_K, air_c)
         self._set_air(air_c, inputs)
-        if self.by_plant.any():
+        if self.has_plants:
             self._set_plant(inputs)
         self._set_failures(inputs)
         return setpoint_c, flow
@@ -326,9 +327,9 @@ class Liquid:
         """Write what the plant of the CRAC units can do for facility water."""
         share, water_c = inputs.plant_share, inputs.chilled_water_c
         by_plant = self._trim_w if share is None else self._trim_w * share
-        self._inputs["trim_w"][:] = np.where(self.by_plant, by_plant, self._trim_w)
+        self._inputs["trim_w"][:] = np.where(self._by_plant, by_plant, self._trim_w)
         least_c = NO_LEAST_C if water_c is None else water_c + PLANT_APPROACH_K
-        self._inputs["least_water_c"][:] = np.where(self.by_plant, least_c, NO_LEAST_C)
+        self._inputs["least_water_c"][:] = np.where(self._by_plant, least_c, NO_LEAST_C)
 
     def _set_air(self, air_c: F64, inputs: LiquidInputs) -> None:
         """Write the temperature of the air or tower water that cools, without and with pads."""
@@ -447,8 +448,8 @@ class Liquid:
             evaporated_w = np.where(self._is_tower, np.maximum(dc["cooler_w"], 0.0), evaporated_w)
         chiller_w = np.zeros(self._size)
         trim_load_w, to_plant_w = dc["trim_load_w"], np.zeros(self._size)
-        if self.by_plant.any():
-            to_plant_w = np.where(self.by_plant, trim_load_w, 0.0)
+        if self.has_plants:
+            to_plant_w = np.where(self._by_plant, trim_load_w, 0.0)
             trim_load_w = trim_load_w - to_plant_w
         if self._trims and trim_load_w.any():
             chiller_w = self._trim_chiller_w(trim_load_w, dc["facility_setpoint_c"], inputs)

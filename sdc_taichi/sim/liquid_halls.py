@@ -127,7 +127,6 @@ class LiquidHalls:
             [s.cdus.pump_share if s.cdus.pumps > 1 else 0.0 for s in sections if s is not None]
         ).repeat(np.diff(fleet.cdu_offsets)[[s is not None for s in sections]])
         self._water_side = sizing.water_side
-        self._has_plants = bool(self._model.by_plant.any())
         hall.take_heat_of(self._racks)
         weather = zip(fleet.configs, sizing.design_outdoor_c, sizing.design_wet_bulb_c, strict=True)
         odd = [(c.name, odd_w_class(c, float(dry), float(wet))) for c, dry, wet in weather]
@@ -298,13 +297,13 @@ class LiquidHalls:
             without_coolant=without_coolant,
             throttled_tasks=throttled,
             state=self._kept(after),
-            to_plant_w=values["liquid_to_plant_w"] if self._has_plants else None,
+            to_plant_w=values["liquid_to_plant_w"] if self._model.has_plants else None,
             without_room_tasks=np.zeros(size),
         )
 
     def _chilled_water_c(self, supply: Supply) -> F64 | None:
         """Return the chilled water of plants that cool facility water, in C, (B,)."""
-        if not self._has_plants:
+        if not self._model.has_plants:
             return None
         return chilled_water_c(supply.water_setpoint_c, self._water_side)
 
@@ -330,7 +329,7 @@ class LiquidHalls:
     def _failures(self, surroundings: Surroundings) -> dict[str, Any]:
         """Return the failures as arguments of ``LiquidInputs``."""
         failures: dict[str, Any] = {"leak_l": surroundings.leaked_l}
-        if self._has_plants:
+        if self._model.has_plants:
             plant = surroundings.chiller_share * surroundings.pump_share
             failures["plant_share"] = np.where(surroundings.powered > 0.0, plant, 0.0)
         if surroundings.cdu_up is None and surroundings.fully_powered:

@@ -21,7 +21,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Hall
 from sdc_taichi.sim.hall_state import Conditions, HallSums
 from sdc_taichi.sim.liquid_fleet import liquid_design
-from sdc_taichi.types import F64, fields_of
+from sdc_taichi.types import F64, Values, fields_of
 
 WATER_DENSITY_KG_M3 = 1000.0
 """Density of water, in kg/m3."""
@@ -169,14 +169,16 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         fleet, cooling_w + pump_heat_w, outdoor_c, wet_bulb_c
     )
     water_side = _water_side(
-        fleet, cooling_w, chiller_w, at_design.rejected_w, crac_flow_m3s, outdoor_c, wet_bulb_c
+        fleet,
+        cooling_w,
+        chiller_w,
+        at_design.rejected_w,
+        crac_flow_m3s,
+        outdoor_c,
+        wet_bulb_c,
+        facility_water_w,
     )
-    water_side = replace(
-        water_side,
-        fullest_condenser_c=fullest_c,
-        facility_water_w=facility_water_w,
-        coil_rise_k=(cooling_w - facility_water_w) / (air_j_per_m3_k(fleet) * crac_flow_m3s),
-    )
+    water_side = replace(water_side, fullest_condenser_c=fullest_c)
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = (
         it_w
@@ -395,8 +397,12 @@ def _water_side(
     crac_flow_m3s: F64,
     outdoor_c: F64,
     wet_bulb_c: F64,
+    facility_water_w: Values = 0.0,
 ) -> WaterSideDesign:
-    """Size tower, pumps and economiser for the given heat flows and CRAC airflow, (B,) each."""
+    """Size tower, pumps and economiser for the given heat flows and CRAC airflow, (B,) each.
+
+    ``cooling_w`` contains ``facility_water_w``, which the coils do not remove.
+    """
     v = fleet.values
     approach_k = v("hvac.tower.approach_min_k")
     if PLANTS[fleet.models["plant"]].dry:
@@ -417,7 +423,8 @@ def _water_side(
         fullest_condenser_c=v("hvac.chiller.min_condenser_c"),
         tower_range_k=v("hvac.tower.water_range_k"),
         max_condenser_c=v("hvac.chiller.max_condenser_c"),
-        coil_rise_k=cooling_w / (air_j_per_m3_k(fleet) * crac_flow_m3s),
+        coil_rise_k=(cooling_w - facility_water_w) / (air_j_per_m3_k(fleet) * crac_flow_m3s),
+        facility_water_w=facility_water_w,
         **_condenser_slopes(fleet, outdoor_c, wet_bulb_c),
         warmest_chilled_c=np.full(fleet.size, CHILLERS[fleet.models["chiller"]].warmest_water_c),
         pumped_w=cooling_w,
