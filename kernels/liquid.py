@@ -96,7 +96,7 @@ def power_3_4(x):
 
 @ti.func
 @no_type_check
-def flow_for(liquid: ti.template(), wanted, ua, wall, side, c_s, y_s, c_f, low, high):
+def flow_for(liquid: ti.template(), wanted, ua, wall, side, c_s, y_s, c_f, low, high, start):
     """Return the flow ratio of side f at which an exchanger has a wanted conductance, and that one.
 
     The conductance K is heat per difference of entering temperatures, effectiveness times the
@@ -119,13 +119,17 @@ def flow_for(liquid: ti.template(), wanted, ua, wall, side, c_s, y_s, c_f, low, 
         c_f: capacity rate of side f at design, in W/K.
         low: smallest flow ratio of side f.
         high: largest flow ratio of side f.
+        start: estimate of the flow ratio of side f, such as that of the last substep; 0 for none.
     """
     fixed = wall + (1.0 - wall) * side / power_3_4(y_s)
     film = (1.0 - wall) * (1.0 - side)
     per_s, per_f = 1.0 / c_s, 1.0 / c_f
     target = 1.0 / ti.max(wanted, liquid.real(1e-9) * c_f)
     least, most = 1.0 / high, 1.0 / low
-    at = clip(c_f * target, least, most)
+    at = c_f * target
+    if start > 0.0:
+        at = 1.0 / start
+    at = clip(at, least, most)
     inverse, step = liquid.real(1.0), 0
     while step <= NEWTON_STEPS:
         power = film * power_3_4(at)
@@ -179,6 +183,7 @@ def _begin_step(liquid: ti.template(), dc):
     while c < liquid.cdu_offsets[end]:
         liquid.cdus[c].heat_w = 0.0
         liquid.cdus[c].valve = 0.0
+        liquid.cdus[c].valve_now = 0.0
         c += liquid.one
     while m < end:
         on, r = liquid.real(0.0), liquid.rack_offsets[m]
@@ -200,6 +205,7 @@ def _begin_step(liquid: ti.template(), dc):
         m += liquid.one
     of_dc = liquid.dcs[dc]
     of_dc.cdu_pump_w = 0.0
+    of_dc.airflow = 0.0
     _clear_facility(liquid, dc)
     of_dc.stored_w = 0.0
     of_dc.throttle_s = -1.0
@@ -605,10 +611,12 @@ def _cdu_valve(liquid: ti.template(), c, wanted, most_open, last: ti.template())
                 cdu.design_w_per_k,
                 low,
                 high,
+                cdu.valve_now,
             )
             # At its smallest flow a bypass keeps the coolant from becoming too cold.
             if valve < low * liquid.real(1.0 + 1e-9):
                 k = ti.min(k, wanted)
+        cdu.valve_now = valve
         last.wanted, last.w_per_k, last.valve, last.k = wanted, cdu.w_per_k, valve, k
     return last.valve, last.k
 
@@ -726,7 +734,9 @@ def _cooler(liquid: ti.template(), dc, water, into_c, heat_w):
             of_dc.cooler_air_w_per_k,
             of_dc.min_fan,
             fastest,
+            of_dc.airflow,
         )
+        of_dc.airflow = z
         wets += 2
         if k < wanted * liquid.real(1.0 - 1e-6) and of_dc.wet_c < air_c:
             air_c = of_dc.wet_c

@@ -77,8 +77,9 @@ CDU_OUT = {
     "k_w_per_k": "heat per kelvin of return minus facility water, in W/K",
     "w_per_k": "heat capacity rate of the coolant, in W/K",
     "is_full": "1 if its valve is fully open, else 0",
+    "valve_now": "flow of facility water in the last sweep or substep, as a share of design",
 }
-"""Results of each CDU, the last two only used within the kernel."""
+"""Results of each CDU, the last three only used within the kernel."""
 LOOP_COEFFICIENTS = {"loop_j_per_k": "heat capacity of the coolant of the loop, in J/K"}
 """Constant of each manifold."""
 LOOP_STATE = {
@@ -166,6 +167,7 @@ DC_OUT = {
     "throttle_s": "time of the first throttling, in s; -1 without",
     "trip_s": "time of the first trip, in s; -1 without",
     "sweeps": "number of sweeps, or of substeps",
+    "airflow": "airflow of the cooler in the last sweep or substep, as a share of design",
 }
 """Results of each data center."""
 ARGUMENTS = {

@@ -135,6 +135,7 @@ def test_six_newton_steps_find_the_flow_for_a_conductance() -> None:
         "one": Argument("i32"),
         "wanted": Argument("f64", 1),
         "y_s": Argument("f64", 1),
+        "starts": Argument("f64", 1),
         "out": Argument("f64", 2),
     }
 
@@ -145,7 +146,7 @@ def test_six_newton_steps_find_the_flow_for_a_conductance() -> None:
             y, k = flow_for(
                 test, test.wanted[i], test.real(325e3), test.real(0.1), test.real(0.5),
                 test.real(325e3 / 3) * test.y_s[i], test.y_s[i], test.real(325e3 / 3),
-                test.real(0.05), test.real(1.2),
+                test.real(0.05), test.real(1.2), test.starts[i],
             )  # fmt: skip
             test.out[0, i], test.out[1, i] = y, k
 
@@ -161,7 +162,10 @@ def test_six_newton_steps_find_the_flow_for_a_conductance() -> None:
     ua = 325e3 * plant.ua_share(y_s, y, wall_share=0.1, side_share=0.5)
     wanted, out = plant.conductance_w_per_k(ua, c * y_s, c * y), np.zeros((2, 4000))
     runtime.ensure_started()
-    NamedKernel(kernel(), spec)(serial=True, slices=1, one=1, wanted=wanted, y_s=y_s, out=out)
+    starts = np.where(rng.random(4000) < 0.5, 0.0, y * rng.uniform(0.8, 1.25, 4000))
+    NamedKernel(kernel(), spec)(
+        serial=True, slices=1, one=1, wanted=wanted, y_s=y_s, starts=starts, out=out
+    )
     close(out[1], wanted, 1e-8)
     close(out[0], y, 1e-6)
 
