@@ -106,10 +106,10 @@ def train_command(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train agents with PPO, IPPO, MAPPO, HAPPO, HAA2C, HAD3QN or HASAC.
+    """Train agents with PPO, IPPO, MAPPO, HAPPO, HAA2C, HAD3QN, HASAC or cross-entropy search.
 
-    Writes policies, curves and checkpoints to a folder. What is trained can be used as a
-    controller: policy:FOLDER.
+    Writes policies, curves and checkpoints to a folder. The policies are a controller:
+    policy:FOLDER.
     """
     values: dict[str, Any] = {}
     if algorithm is not None:
