@@ -69,11 +69,16 @@ def train_command(
         typer.Option(metavar="N", help="Steps of all data centers together. [default: 2e6]"),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="Of all that is random. [default: 0]")
+        int | None,
+        typer.Option(min=0, max=2**31 - 1, help="Seed of all random numbers. [default: 0]"),
     ] = None,
     agents: Annotated[
         str | None,
-        typer.Option(metavar="NAME[,NAME]", help="Agents that learn: load, cooling, battery."),
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="Agents that learn: load, cooling, battery, agent_geo, crac, plant, cdu, "
+            "power_cap.",
+        ),
     ] = None,
     others: Annotated[
         str | None,
@@ -85,7 +90,9 @@ def train_command(
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="carbon, carbon-rich, bill, bill-rich or failures."),
+        typer.Option(
+            metavar="NAME", help="carbon, carbon-rich, bill, bill-rich, failures or hall."
+        ),
     ] = None,
     settings: Annotated[
         Path | None,
