@@ -46,6 +46,14 @@ def real_data() -> Path:
 
 
 @pytest.fixture
+def user_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of imported files, which does not exist yet."""
+    folder = tmp_path / "user"
+    monkeypatch.setenv("SDC_TAICHI_DATA", str(folder))
+    return folder
+
+
+@pytest.fixture
 def one_torch_thread() -> Iterator[None]:
     """Lets PyTorch use one thread, as learners of this package do: sums have the same bits then."""
     torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")

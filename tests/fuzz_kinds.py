@@ -502,7 +502,7 @@ def hostile_servers(rng: Generator, folder: Path) -> Case:
             slow = drips_within(whole[:at], drop, whole[at:], 0.02, lambda: server.stopped)
             server.answers = [slow if dripping else sends_bytes(whole)]
             try:
-                fetch([request_to(server.url, key=SECRET)], folder / "kept", patience=patience)
+                fetch([request_to(server.url, key=SECRET)], patience=patience)
             finally:
                 server.stopped.set()
                 for thread in threading.enumerate():

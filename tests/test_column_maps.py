@@ -21,13 +21,6 @@ STATION = ("--latitude", "40.7", "--longitude", "-75", "--elevation", "10", "--u
 WEATHER = ("timestamp=when", "dry_bulb:F=t", "dew_point:F=td", "pressure:inHg=p")
 
 
-@pytest.fixture
-def user_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "user"
-    monkeypatch.setenv("SDC_TAICHI_DATA", str(folder))
-    return folder
-
-
 def run(*arguments: str) -> Result:
     return build.run_data("import", *arguments)
 

@@ -32,13 +32,6 @@ from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.exogenous.synthetic import synthetic_sites
 
 
-@pytest.fixture
-def user_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "user"
-    monkeypatch.setenv("SDC_TAICHI_DATA", str(folder))
-    return folder
-
-
 @pytest.fixture(scope="session")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A SustainDC data folder with one complete site, a second station, and leftovers."""

@@ -297,15 +297,15 @@ def test_redirects_are_followed_without_the_key_and_end() -> None:
 
 
 def test_the_key_is_neither_logged_nor_kept(
-    caplog: pytest.LogCaptureFixture, tmp_path: Path
+    caplog: pytest.LogCaptureFixture, user_folder: Path
 ) -> None:
     echo = json.dumps({"request": {"params": {"api_key": SECRET}}, "rows": []}).encode()
     caplog.set_level(logging.DEBUG)
     with serving(sends(echo)) as server:
-        (kept,) = fetch([request_to(server.url, key=SECRET)], tmp_path, patience=QUICK)
+        (kept,) = fetch([request_to(server.url, key=SECRET)], patience=QUICK)
     assert "GET /data" in caplog.text
     assert SECRET not in caplog.text
-    for path in tmp_path.rglob("*"):
+    for path in user_folder.rglob("*"):
         assert path.is_dir() or SECRET.encode() not in path.read_bytes()
     assert SECRET not in repr(request_to("", key=SECRET))
     assert b'"api_key": "KEY"' in kept.content
@@ -372,11 +372,12 @@ def test_cookies_do_not_carry_the_key_to_another_host() -> None:
         assert SECRET not in str(other.seen)
 
 
-def test_a_second_fetch_needs_no_network(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("user_folder")
+def test_a_second_fetch_needs_no_network() -> None:
     with serving(sends(CONTENT)) as server:
         request = request_to(server.url)
-        (first,) = fetch([request], tmp_path, patience=QUICK)
-    (second,) = fetch([request], tmp_path, patience=QUICK)
+        (first,) = fetch([request], patience=QUICK)
+    (second,) = fetch([request], patience=QUICK)
     assert second == first
     assert first.origin["licence"] == "none"
     assert first.origin["url"].endswith("/data?a=1")
@@ -387,10 +388,11 @@ def test_a_second_fetch_needs_no_network(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["content", "origin", "no origin", "request"])
-def test_what_is_damaged_is_downloaded_again(tmp_path: Path, damage: str) -> None:
+@pytest.mark.usefixtures("user_folder")
+def test_what_is_damaged_is_downloaded_again(damage: str) -> None:
     with serving(sends(CONTENT)) as server:
         request = request_to(server.url)
-        (kept,) = fetch([request], tmp_path, patience=QUICK)
+        (kept,) = fetch([request], patience=QUICK)
         origin = kept.path.with_name("data.json.origin.json")
         if damage == "content":
             kept.path.write_bytes(CONTENT[:-1])
@@ -400,16 +402,16 @@ def test_what_is_damaged_is_downloaded_again(tmp_path: Path, damage: str) -> Non
             origin.unlink()
         else:
             request = replace(request, query={"a": "2"})
-        fetch([request], tmp_path, patience=QUICK)
+        fetch([request], patience=QUICK)
         assert len(server.seen) == 2
-        fetch([request], tmp_path, patience=QUICK, refresh=True)
+        fetch([request], patience=QUICK, refresh=True)
         assert len(server.seen) == 3
 
 
-def test_nothing_is_kept_of_a_bad_answer(tmp_path: Path) -> None:
+def test_nothing_is_kept_of_a_bad_answer(user_folder: Path) -> None:
     with serving(sends(b"no json")) as server, pytest.raises(DataError):
-        fetch([request_to(server.url)], tmp_path, patience=QUICK)
-    assert list(tmp_path.rglob("*")) == []
+        fetch([request_to(server.url)], patience=QUICK)
+    assert not user_folder.exists()
 
 
 @pytest.mark.parametrize("value", ["", "  ", "abc", "has space 123", "naïve-key-123", "x" * 300])

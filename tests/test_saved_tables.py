@@ -22,6 +22,8 @@ EIA_NAMES = {
 }
 BRUSSELS = "Europe/Brussels"
 
+pytestmark = pytest.mark.usefixtures("user_folder")
+
 
 def generation(year: int = 2022) -> pd.DataFrame:
     """Sun, gas and nuclear of ``build.carbon_lines`` in MW, by the start of the hour in UTC."""
@@ -173,8 +175,8 @@ MADE: dict[str, Callable[[Path], list[Path]]] = {
 }
 
 
-def imported(paths: list[Path], service: str, folder: Path, area: str | None = None) -> np.ndarray:
-    item = import_saved_tables(paths, service, "x", data_dir=folder, area=area, utc_offset_h=-5.0)
+def imported(paths: list[Path], service: str, area: str | None = None) -> np.ndarray:
+    item = import_saved_tables(paths, service, "x", area=area, utc_offset_h=-5.0)
     return read_carbon(item.target, -5.0).values
 
 
@@ -183,7 +185,6 @@ def test_half_years_of_eia(tmp_path: Path) -> None:
         eia_files(tmp_path)[::-1],
         "eia-930",
         "x",
-        data_dir=tmp_path / "user",
         area="ciso",
         utc_offset_h=-5.0,
     )
@@ -202,21 +203,19 @@ def test_columns_of_the_transparency_platform(layout: str, tmp_path: Path) -> No
         header = "MTU (CET/CEST)" if layout == "header" else "MTU"
         paths = entsoe_wide(tmp_path, header, "CET/CEST")
     expected = expected_intensity(tmp_path, "start")
-    np.testing.assert_allclose(imported(paths, "entsoe", tmp_path / "user"), expected, atol=2e-3)
+    np.testing.assert_allclose(imported(paths, "entsoe"), expected, atol=2e-3)
 
 
 def test_rows_of_the_transparency_platform(tmp_path: Path) -> None:
     paths = entsoe_long(tmp_path)
     expected = expected_intensity(tmp_path, "start")
-    found = imported(paths, "entsoe", tmp_path / "user", "DE-LU")
+    found = imported(paths, "entsoe", "DE-LU")
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
 def test_years_of_electricity_maps_are_joined(tmp_path: Path) -> None:
     paths = electricity_maps(tmp_path)
-    item = import_saved_tables(
-        paths, "electricity-maps", "x", data_dir=tmp_path / "user", utc_offset_h=0.0
-    )
+    item = import_saved_tables(paths, "electricity-maps", "x", utc_offset_h=0.0)
     values = read_carbon(item.target, 0.0).values
     np.testing.assert_array_equal(values, np.arange(2 * 8760) % 500)
 
@@ -225,9 +224,7 @@ def test_years_of_electricity_maps_are_joined(tmp_path: Path) -> None:
 def test_origin_and_source_are_kept(service: str, tmp_path: Path) -> None:
     paths = MADE[service](tmp_path)
     area = "CISO" if service == "eia-930" else None
-    item = import_saved_tables(
-        paths, service, "x", data_dir=tmp_path / "user", area=area, utc_offset_h=-5.0
-    )
+    item = import_saved_tables(paths, service, "x", area=area, utc_offset_h=-5.0)
     origin = (read_metadata(item.target) or {})["origin"]
     assert origin["service"] == saved_table_services()[service].title
     assert [each["file"] for each in origin["downloads"]] == [path.name for path in paths]
@@ -267,12 +264,14 @@ def damage(path: Path, old: str, new: str, count: int = 1) -> None:
         ("electricity-maps", "Datetime (UTC)", "When", "expected 'Datetime .UTC.'"),
     ],
 )
-def test_damaged_tables(service: str, old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_damaged_tables(
+    service: str, old: str, new: str, message: str, tmp_path: Path, user_folder: Path
+) -> None:
     paths = MADE[service](tmp_path)
     damage(paths[0], old, new)
     with pytest.raises(DataError, match=message):
-        imported(paths, service, tmp_path / "user", "CISO" if service == "eia-930" else None)
-    assert not list((tmp_path / "user").rglob("*.parquet"))
+        imported(paths, service, "CISO" if service == "eia-930" else None)
+    assert not list(user_folder.rglob("*.parquet"))
 
 
 @pytest.mark.parametrize(
@@ -288,12 +287,12 @@ def test_damaged_tables(service: str, old: str, new: str, message: str, tmp_path
 def test_areas(service: str, area: str | None, message: str, tmp_path: Path) -> None:
     paths = MADE.get(service, entsoe_wide)(tmp_path)
     with pytest.raises(DataError, match=message.replace("|", r"\|")):
-        imported(paths, service, tmp_path / "user", area)
+        imported(paths, service, area)
 
 
 def test_months_of_watttime_are_joined(tmp_path: Path) -> None:
     paths = watttime(tmp_path)
-    item = import_saved_tables(paths, "watttime", "x", data_dir=tmp_path / "user", utc_offset_h=0.0)
+    item = import_saved_tables(paths, "watttime", "x", utc_offset_h=0.0)
     series = read_carbon(item.target, 0.0)
     stamps = np.arange(365 * 288)
     expected = 0.45359237 * np.round(800 + 200 * np.sin(stamps / 500), 3)

@@ -104,20 +104,19 @@ class Origin:
     """Conversions between the downloads and the file, with their counts."""
 
 
-def site_name(name: str, data_dir: Path | None = None) -> str:
+def site_name(name: str) -> str:
     """Return the name under which a site is or will be stored.
 
     Raises:
         DataError: the name is not usable, or belongs to an embedded site.
     """
-    return _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
+    return _stored_name(new_name("site", name, synthetic_sites()), imported_sites())
 
 
 def import_weather(
     path: Path,
     name: str,
     base: str | None,
-    data_dir: Path | None = None,
     *,
     place: Place | None = None,
     stamp: Literal["start", "end"] = "start",
@@ -129,7 +128,7 @@ def import_weather(
     A table does not contain the location of its station, so ``read_weather_table`` reads it with
     ``place``, ``stamp`` and ``columns``. Without a place, the file must be an EPW file.
     """
-    name = site_name(name, data_dir)
+    name = site_name(name)
     if place is None:
         weather = read_epw(path)
     else:
@@ -153,7 +152,7 @@ def import_weather(
         "design": _design_metadata(weather.design),
         "base": base,
     }
-    target = user_data_dir(data_dir) / "sites" / name / "weather.parquet"
+    target = user_data_dir() / "sites" / name / "weather.parquet"
     return _store(path, name, target, [s for s in series if s is not None], metadata, origin)
 
 
@@ -168,7 +167,6 @@ def import_carbon(
     path: Path,
     name: str,
     base: str | None,
-    data_dir: Path | None = None,
     *,
     utc_offset_h: float | None = None,
     stamp: Stamp = "auto",
@@ -182,20 +180,16 @@ def import_carbon(
     Raises:
         DataError: the UTC offset is not known, or differs from that of the weather.
     """
-    name = site_name(name, data_dir)
-    offset, longitude = site_clock(name, base, data_dir, utc_offset_h=utc_offset_h)
+    name = site_name(name)
+    offset, longitude = site_clock(name, base, utc_offset_h=utc_offset_h)
     series = read_carbon(path, offset, stamp, longitude_deg=longitude, columns=columns)
     metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": "local", "base": base}
-    target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
+    target = user_data_dir() / "sites" / name / "carbon.parquet"
     return _store(path, name, target, [series], metadata, origin)
 
 
 def site_clock(
-    name: str,
-    base: str | None,
-    data_dir: Path | None = None,
-    *,
-    utc_offset_h: float | None = None,
+    name: str, base: str | None, *, utc_offset_h: float | None
 ) -> tuple[float, float | None]:
     """Return the UTC offset of a site in h, and its longitude in degrees east (None if unknown).
 
@@ -205,14 +199,13 @@ def site_clock(
     Args:
         name: name of the site.
         base: embedded site that supplies missing data.
-        data_dir: folder of imported files instead of the user's.
         utc_offset_h: local standard time minus UTC, in h.
 
     Raises:
         DataError: no offset is known, or ``utc_offset_h`` differs from the known one.
     """
     offset, longitude = utc_offset_h, None
-    weather_path = imported_sites(data_dir).get(name, {}).get("weather")
+    weather_path = imported_sites().get(name, {}).get("weather")
     if weather_path is not None or (base is not None and offset is None):
         if weather_path is not None:
             station = read_epw(weather_path)
@@ -232,15 +225,11 @@ def site_clock(
 
 
 def import_workload(
-    path: Path,
-    name: str,
-    data_dir: Path | None = None,
-    *,
-    columns: Mapping[str, str] = MappingProxyType({}),
+    path: Path, name: str, *, columns: Mapping[str, str] = MappingProxyType({})
 ) -> Imported:
     """Store a workload file as ``traces/NAME.parquet``; see ``read_workload`` for ``columns``."""
-    name = _stored_name(new_name("trace", name, synthetic_traces()), imported_traces(data_dir))
-    target = user_data_dir(data_dir) / "traces" / f"{name}.parquet"
+    name = _stored_name(new_name("trace", name, synthetic_traces()), imported_traces())
+    target = user_data_dir() / "traces" / f"{name}.parquet"
     trace = read_workload(path, columns=columns)
     return _store(path, name, target, [trace], {"kind": "workload"})
 

@@ -131,7 +131,6 @@ def read_key(service: Service) -> str:
 
 def fetch(
     requested: Sequence[Request],
-    data_dir: Path | None = None,
     *,
     refresh: bool = False,
     patience: Patience | None = None,
@@ -141,7 +140,6 @@ def fetch(
 
     Args:
         requested: the requests.
-        data_dir: folder of imported files instead of the user's.
         refresh: True to download stored answers again.
         patience: limits on time and attempts of each download.
         progress: callback ``(done, total)`` with numbers of answers.
@@ -152,13 +150,13 @@ def fetch(
     answers = []
     for done, request in enumerate(requested):
         progress(done, len(requested))
-        stored = None if refresh else _stored(request, data_dir)
-        answers.append(stored or _store(request, download(request, patience), data_dir))
+        stored = None if refresh else _stored(request)
+        answers.append(stored or _store(request, download(request, patience)))
     progress(len(requested), len(requested))
     return answers
 
 
-def keep_file(request: Request, path: Path, data_dir: Path | None = None) -> Kept:
+def keep_file(request: Request, path: Path) -> Kept:
     """Store a file that the user downloaded as the answer to a request.
 
     Raises:
@@ -166,7 +164,7 @@ def keep_file(request: Request, path: Path, data_dir: Path | None = None) -> Kep
     """
     content = read_bytes(path, request.most_bytes, DataError)
     request.check(content, str(path))
-    return _store(request, content, data_dir)
+    return _store(request, content)
 
 
 def write_file(path: Path, content: bytes) -> Path:
@@ -183,9 +181,9 @@ def write_file(path: Path, content: bytes) -> Path:
     return path
 
 
-def downloads_dir(service: Service, data_dir: Path | None = None) -> Path:
+def downloads_dir(service: Service) -> Path:
     """Return the folder in which answers of a service are stored."""
-    return user_data_dir(data_dir) / "downloads" / service.name
+    return user_data_dir() / "downloads" / service.name
 
 
 def download(
@@ -275,15 +273,15 @@ def _refuse(request: Request, answer: Answer) -> None:
     raise DataError(f"{request.url}: status {status}{phrase}{explained}")
 
 
-def _paths(request: Request, data_dir: Path | None) -> tuple[Path, Path]:
+def _paths(request: Request) -> tuple[Path, Path]:
     """Return the paths of an answer and of its origin file."""
-    path = downloads_dir(request.service, data_dir) / request.file_name
+    path = downloads_dir(request.service) / request.file_name
     return path, path.with_name(f"{path.name}.origin.json")
 
 
-def _stored(request: Request, data_dir: Path | None) -> Kept | None:
+def _stored(request: Request) -> Kept | None:
     """Return the stored answer; None if it is absent, damaged, or of another request."""
-    path, origin_path = _paths(request, data_dir)
+    path, origin_path = _paths(request)
     if not (path.is_file() and origin_path.is_file()):
         return None
     try:
@@ -295,8 +293,8 @@ def _stored(request: Request, data_dir: Path | None) -> Kept | None:
         return None
 
 
-def _store(request: Request, content: bytes, data_dir: Path | None) -> Kept:
-    path, origin_path = _paths(request, data_dir)
+def _store(request: Request, content: bytes) -> Kept:
+    path, origin_path = _paths(request)
     origin = {
         "format": FORMAT,
         "service": request.service.title,

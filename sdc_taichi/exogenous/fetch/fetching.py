@@ -21,7 +21,6 @@ from sdc_taichi.exogenous.fetch.download import (
     keep_file,
     write_file,
 )
-from sdc_taichi.exogenous.fetch.exchange import Patience
 from sdc_taichi.exogenous.fetch.generation import (
     carbon_table,
     read_generation,
@@ -39,12 +38,8 @@ class Destination:
     """Name of the site."""
     base: str | None = None
     """Embedded site that supplies missing data; None for no base."""
-    data_dir: Path | None = None
-    """Folder of imported files instead of the user's."""
     refresh: bool = False
     """True to download stored answers again."""
-    patience: Patience | None = None
-    """Limits on time and attempts of each download; None for the defaults."""
     progress: Callable[[int, int], None] = lambda done, total: None
     """Callback ``(done, total)`` with numbers of downloads."""
 
@@ -62,13 +57,7 @@ class Destination:
 
     def downloads(self, requested: Sequence[Request]) -> list[Kept]:
         """Return answers to requests, either stored or downloaded."""
-        return fetch(
-            requested,
-            self.data_dir,
-            refresh=self.refresh,
-            patience=self.patience,
-            progress=self.progress,
-        )
+        return fetch(requested, refresh=self.refresh, progress=self.progress)
 
 
 def fetch_pvgis(
@@ -90,11 +79,11 @@ def fetch_pvgis(
     Raises:
         DataError: the typical year is not available or not valid.
     """
-    name = importing.site_name(into.site, into.data_dir)
+    name = importing.site_name(into.site)
     request = weather.request_year(latitude_deg, longitude_deg)
     weather.check_offset(utc_offset_h, longitude_deg)
     if file is not None:
-        answer = keep_file(request, file, into.data_dir)
+        answer = keep_file(request, file)
     else:
         (answer,) = into.downloads([request])
     table, place = weather.typical_year(answer.content, request.url, utc_offset_h)
@@ -102,9 +91,7 @@ def fetch_pvgis(
     write_file(path, table)
     origin = _origin(request.service, [answer], ["moved from UTC to local standard time"])
     with into.checking():
-        return importing.import_weather(
-            path, name, into.base, into.data_dir, place=place, origin=origin
-        )
+        return importing.import_weather(path, name, into.base, place=place, origin=origin)
 
 
 def fetch_epw(into: Destination, url: str) -> importing.Imported:
@@ -117,7 +104,7 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
     Raises:
         DataError: the EPW file is not available or not valid.
     """
-    name = importing.site_name(into.site, into.data_dir)
+    name = importing.site_name(into.site)
     request = weather.request_epw(url)
     (answer,) = into.downloads([request])
     path, plain = answer.path, weather.epw_bytes(answer.content, request.url)
@@ -126,7 +113,7 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
         path = write_file(path.with_name(f"{path.stem}.unpacked.epw"), plain)
     origin = _origin(request.service, [answer])
     with into.checking():
-        return importing.import_weather(path, name, into.base, into.data_dir, origin=origin)
+        return importing.import_weather(path, name, into.base, origin=origin)
 
 
 def fetch_generation(
@@ -158,13 +145,12 @@ def fetch_generation(
         for period, answer, request in zip(periods, answers, requested, strict=True)
     ]
     table, notes = carbon_table(parts, service)
-    path = write_file(downloads_dir(service, into.data_dir) / f"{code}_{year}.csv", table)
+    path = write_file(downloads_dir(service) / f"{code}_{year}.csv", table)
     with into.checking():
         return importing.import_carbon(
             path,
             into.site,
             into.base,
-            into.data_dir,
             utc_offset_h=utc_offset_h,
             stamp=service.stamp,
             origin=_origin(service, answers, notes),
@@ -213,7 +199,6 @@ def fetch_electricity_maps(
             answer.path,
             into.site,
             into.base,
-            into.data_dir,
             utc_offset_h=utc_offset_h,
             stamp=service.stamp,
             columns=_intensity_columns(answer.content, request.url),
@@ -249,8 +234,8 @@ def _check(into: Destination, service: Service, year: int, utc_offset_h: float |
         raise DataError(
             f"--year {year}: expected {first} to {this_year - 1}, a calendar year that is over"
         )
-    name = importing.site_name(into.site, into.data_dir)
-    importing.site_clock(name, into.base, into.data_dir, utc_offset_h=utc_offset_h)
+    name = importing.site_name(into.site)
+    importing.site_clock(name, into.base, utc_offset_h=utc_offset_h)
 
 
 def _origin(service: Service, kept: Sequence[Kept], notes: Sequence[str] = ()) -> importing.Origin:

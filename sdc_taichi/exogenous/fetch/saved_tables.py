@@ -57,7 +57,6 @@ def import_saved_tables(
     service_name: str,
     site: str,
     base: str | None = None,
-    data_dir: Path | None = None,
     *,
     area: str | None = None,
     utc_offset_h: float | None = None,
@@ -69,7 +68,6 @@ def import_saved_tables(
         service_name: name of the service, one of ``saved_table_services``.
         site: name of the site.
         base: embedded site that supplies missing data.
-        data_dir: folder of imported files instead of the user's.
         area: balancing authority or zone, for tables with several.
         utc_offset_h: UTC offset of the site, in h; None stands for that of its weather or base.
 
@@ -77,12 +75,12 @@ def import_saved_tables(
         DataError: the data are not valid; the message names file, row, column, value, valid values.
     """
     service = find_service(service_name)
-    name = importing.site_name(site, data_dir)
-    importing.site_clock(name, base, data_dir, utc_offset_h=utc_offset_h)
+    name = importing.site_name(site)
+    importing.site_clock(name, base, utc_offset_h=utc_offset_h)
     tables = [_read(path, service, area) for path in paths]
     convert = _intensity_table if _layout(service).intensity else _generation_table
     content, notes = convert(tables, service)
-    folder = downloads_dir(service, data_dir)
+    folder = downloads_dir(service)
     table = write_file(folder / f"{name}_by_hand.csv", content)
     saved = tuple({"file": path.name, "sha256": files.sha256(path)} for path in paths)
     origin = importing.Origin(service.title, service.licence, saved, tuple(notes))
@@ -90,7 +88,6 @@ def import_saved_tables(
         table,
         name,
         base,
-        data_dir,
         utc_offset_h=utc_offset_h,
         stamp=service.stamp,
         origin=origin,
