@@ -76,7 +76,7 @@ class DataSet:
     @property
     def best(self) -> str | None:
         """Name of the first optimum with a higher return than idle commands; None without one."""
-        optima = [name for name in self.collection.controllers if is_optimum(name)]
+        optima = [x for x in self.collection.controllers if objective_of_optimum(x) is not None]
         return next((name for name in optima if self.mean_return(name) > self.mean_return()), None)
 
     def mean_return(self, controller: str = IDLE) -> float:
@@ -120,11 +120,6 @@ def figures_of(episode: Episode) -> dict[str, Any]:
         "changed_commands": episode.changed_commands,
         **{name: float(values.sum()) for name, values in episode.infos.items()},
     }
-
-
-def is_optimum(controller: str) -> bool:
-    """Return True if a name is ``optimum`` or ``optimum:OBJECTIVE``."""
-    return objective_of_optimum(controller) is not None
 
 
 def card(made: DataSet, command: str) -> str:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from sdc_taichi.config import load_config, load_yaml, preset_names, validated
 from sdc_taichi.config.fields import Section, Text
@@ -56,6 +56,20 @@ def _weeks(value: Any) -> Any:
     return parse_weeks(value) if isinstance(value, str) else value
 
 
+def _content(value: Any) -> Any:
+    """Replace the path of a configuration file by its content, which other machines can read."""
+    if isinstance(value, str) and value not in preset_names():
+        try:
+            return json.loads(load_config(value).model_dump_json())
+        except SdcError as error:
+            raise ValueError(str(error)) from None
+    return value
+
+
+Source = Annotated[
+    Annotated[str, Field(min_length=1)] | dict[str, Any] | None, AfterValidator(_content)
+]
+"""Configuration of a data center: a preset, a file, or the sections of a configuration."""
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=80)]
 """Name of a suite, case or row: lower-case letters, digits, ``.``, ``_`` and ``-``."""
 Weeks = Annotated[
@@ -71,7 +85,7 @@ Seeds = Annotated[int, Field(strict=True, ge=1, le=1000)]
 class OtherDataCenters(Section):
     """Data centers for the results of a case, if they differ from those of the training."""
 
-    config: Annotated[str, Field(min_length=1)] | dict[str, Any] | None = None
+    config: Source = None
     """Configuration of the data center: a preset, a file, or the sections of a configuration; None
     selects that of the training."""
     overrides: dict[str, Any] = Field(default={})
@@ -85,11 +99,6 @@ class OtherDataCenters(Section):
     """Seeds of the synthetic years of each data center; an empty list selects those of the
     training."""
 
-    @field_validator("config")
-    @classmethod
-    def _whole(cls, value: Any) -> Any:
-        return _content(value)
-
 
 class Case(Section):
     """Data centers and weeks in which controllers are compared."""
@@ -102,7 +111,7 @@ class Case(Section):
     scenario: str | None = None
     """Training scenario that provides default data centers and rewards; None selects no
     scenario."""
-    config: Annotated[str, Field(min_length=1)] | dict[str, Any] | None = None
+    config: Source = None
     """Configuration of the data center: a preset, a file, or the sections of a configuration; None
     selects that of the scenario, or preset ``corrected``."""
     overrides: dict[str, Any] = Field(default={})
@@ -141,11 +150,6 @@ class Case(Section):
     optimum: bool = True
     """True to compute optima, which give the share of the achievable saving, and the value of
     stored energy and waiting work at the end of a week."""
-
-    @field_validator("config")
-    @classmethod
-    def _whole(cls, value: Any) -> Any:
-        return _content(value)
 
     def short(self) -> dict[str, Any]:
         """Return the values of the case that differ in the short version of a suite."""
@@ -579,13 +583,3 @@ def _without(values: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
         for name, value in values.items()
         if name not in base or base[name] != value
     }
-
-
-def _content(value: Any) -> Any:
-    """Replace the path of a configuration file by its content, which other machines can read."""
-    if isinstance(value, str) and value not in preset_names():
-        try:
-            return json.loads(load_config(value).model_dump_json())
-        except SdcError as error:
-            raise ValueError(str(error)) from None
-    return value

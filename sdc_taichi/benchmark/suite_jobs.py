@@ -14,6 +14,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -186,37 +187,23 @@ class _SolvedMetrics(Record):
     bound_kinds: list[str]
 
 
-def check_reference(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
-    """Check metrics and table rows that are stored for ``solve_reference``.
-
-    Args:
-        metrics: the metrics.
-        rows: the table rows, which must be empty.
+def _check_without_rows(
+    kind: type[Record], _values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes
+) -> None:
+    """Check the metrics of a job whose result has no table rows.
 
     Raises:
         SdcError: a metric is missing or of another type, or there are rows.
     """
-    _check_without_rows(_SolvedMetrics, metrics, rows)
-
-
-def check_trial(_values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
-    """Check metrics and table rows that are stored for ``run_trial``.
-
-    Args:
-        metrics: the metrics.
-        rows: the table rows, which must be empty.
-
-    Raises:
-        SdcError: a metric is missing or of another type, or there are rows.
-    """
-    _check_without_rows(TrialMetrics, metrics, rows)
-
-
-def _check_without_rows(kind: type[Record], metrics: Mapping[str, Any], rows: bytes) -> None:
-    """Check the metrics of a job whose result has no table rows."""
     validated(kind, metrics, METRICS_FILE)
     if rows:
         raise ConfigError(f"{ROWS_FILE}: valid is a result without rows")
+
+
+check_reference = partial(_check_without_rows, _SolvedMetrics)
+"""Check of what is stored for ``solve_reference``."""
+check_trial = partial(_check_without_rows, TrialMetrics)
+"""Check of what is stored for ``run_trial``."""
 
 
 def check_row(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: bytes) -> None:
