@@ -123,21 +123,21 @@ def default_racks(hall: HallConfig) -> RackSelection:
     return parse_racks(f"hottest:{min(HOTTEST_BY_DEFAULT, hall.racks)},median")
 
 
-def parse_rack(text: str, hall: HallConfig, option: str = "--rack") -> int:
+def parse_rack(text: str, hall: HallConfig) -> int:
     """Return the index of the single rack of a hall that a text RACK or ROW:PLACE names.
 
     Raises:
         ConfigError: The text is no such term, or the hall has no such rack.
     """
     try:
-        term = _term(text, option)
-        RackSelection((term,), option).check(hall)
+        term = _term(text, "--rack")
+        RackSelection((term,), "--rack").check(hall)
         if term.kind in ("rack", "place"):
             return _rack_index(term.numbers, hall)
     except ConfigError:
         pass
     raise ConfigError(
-        f"{option} {text!r}: valid is a rack 0..{hall.racks - 1}, or ROW:PLACE up to "
+        f"--rack {text!r}: valid is a rack 0..{hall.racks - 1}, or ROW:PLACE up to "
         f"{hall.rows - 1}:{hall.racks_per_row - 1}"
     )
 

@@ -51,28 +51,24 @@ def bootstrap_interval(
     strata: I64,
     generator: np.random.Generator,
     *,
-    draws: int = DRAWS,
-    level: float = 0.95,
     paired: bool = False,
 ) -> Interval:
-    """Return a statistic of samples with its percentile interval by a stratified bootstrap.
+    """Return a statistic of samples with its 95 % interval by a stratified bootstrap.
 
     Args:
         statistic: function of the samples.
         samples: samples that share their weeks, (S, W) each; S may differ between samples.
         strata: index of site and of year of each week, (W, 2), as for ``drawn_weeks``.
         generator: random generator of the bootstrap.
-        draws: number of bootstrap resamples.
-        level: confidence level, 0..1.
         paired: True to resample the same trainings in all samples with the same S, which is needed
             if the seed of a training also determines its inputs.
 
     Raises:
         ConfigError: a sample and the strata have different numbers of weeks.
     """
-    weeks = drawn_weeks(strata, generator, draws)
+    weeks = drawn_weeks(strata, generator, DRAWS)
     values = bootstrap_values(statistic, samples, weeks, generator, paired=paired)
-    return percentile_interval(float(statistic(*samples)), values, level)
+    return percentile_interval(float(statistic(*samples)), values)
 
 
 def bootstrap_values(
@@ -111,15 +107,14 @@ def bootstrap_values(
     return np.asarray(statistic(*drawn))
 
 
-def percentile_interval(value: float, drawn: F64, level: float = 0.95) -> Interval:
-    """Return the percentile interval of bootstrap values, with equal tails.
+def percentile_interval(value: float, drawn: F64) -> Interval:
+    """Return the 95 % percentile interval of bootstrap values, with equal tails.
 
     Args:
         value: statistic of the samples without resampling.
         drawn: values of the bootstrap resamples, (draws,).
-        level: confidence level, 0..1.
     """
-    tail = 50.0 * (1.0 - level)
+    tail = 50.0 * (1.0 - 0.95)
     low, high = np.percentile(drawn, [tail, 100.0 - tail])
     return Interval(value, float(low), float(high))
 
@@ -205,7 +200,7 @@ def performance_profile(scores: F64, thresholds: F64) -> F64:
         return np.asarray(np.where(known > 0, above / known, np.nan))
 
 
-def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int = DRAWS) -> I64:
+def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int) -> I64:
     """Return indices of weeks, drawn with replacement level by level, (draws, W).
 
     Each site is replaced by a random site, each of its years by a random year of the drawn site,

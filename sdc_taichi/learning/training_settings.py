@@ -35,7 +35,7 @@ from sdc_taichi.config.fields import Section
 from sdc_taichi.control.registry import is_path
 from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, HALL_AGENTS, Agent
 from sdc_taichi.envs.hall import LARGEST_CHANGES
-from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.options import EnvOptions, fields_set
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.learning.algorithms import LEARNING_SETTINGS, LearningSettings
 from sdc_taichi.learning.split import (
@@ -309,7 +309,7 @@ class TrainingSettings(Section):
             values = merged(SCENARIOS[name], values)
         options = values.get("environment") or {}
         if isinstance(options, EnvOptions):
-            options = _set_options(options)
+            options = fields_set(options)
         if not isinstance(options, Mapping):
             return values
         return merged({"environment": training_environment(options)}, values)
@@ -433,7 +433,7 @@ class TrainingSettings(Section):
         """Return the options of the environments; if ``weeks`` is set, first days are fixed."""
         if self.weeks is None:
             return self.environment
-        return EnvOptions.model_validate(_set_options(self.environment) | {"start": "fixed"})
+        return EnvOptions.model_validate(fields_set(self.environment) | {"start": "fixed"})
 
     def _config(self) -> DataCenterConfig:
         """Return the configuration with its overrides, before sites and weeks are applied."""
@@ -599,17 +599,12 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in over.items():
         if isinstance(value, EnvOptions):
-            value = _set_options(value)
+            value = fields_set(value)
         old = out.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping):
             value = merged(old, value)
         out[key] = value
     return out
-
-
-def _set_options(options: EnvOptions) -> dict[str, Any]:
-    """Return the explicitly set options by name; setting the others could be an error."""
-    return {name: getattr(options, name) for name in options.model_fields_set}
 
 
 def leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

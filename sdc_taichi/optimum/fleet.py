@@ -308,10 +308,6 @@ class FleetOptimum:
         """Emissions of the simulated plan, in kg CO2e, (F,)."""
         return self.achieved_g / 1e3
 
-    def saved_pct(self, emitted_g: F64) -> float:
-        """Return the savings of all fleets together against idle commands, in %."""
-        return float(100.0 * (1.0 - emitted_g.sum() / self.idle_g.sum()))
-
 
 class FleetScore(Score):
     """Accumulates the emissions of F fleets, and sums and extremes of their B data centers.

@@ -60,9 +60,9 @@ def uncoordinated(
     return ways
 
 
-def response_count(players: int, rounds: Sequence[int] = ROUNDS) -> int:
+def response_count(players: int) -> int:
     """Return how often ``uncoordinated`` asks for a best response."""
-    return players * (2 + max(rounds, default=0)) - 1
+    return players * (2 + max(ROUNDS)) - 1
 
 
 def title_of(way: str) -> str:

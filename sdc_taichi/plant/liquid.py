@@ -430,11 +430,3 @@ def size_liquid(fleet: LiquidFleet) -> LiquidSizing:
         cooler_ua_w_per_k=heat_w / plants.approach_k,
         fan_w=plants.fan_share * heat_w,
     )
-
-
-def liquid_at_full_load_w(racks: RackParameters) -> F64:
-    """Return the heat that the coolant takes at full load and ``leak_ref_c``, in W, (L,)."""
-    chips_w = racks.gpus * racks.gpu_max_w + racks.cpus * racks.cpu_max_w
-    door = np.maximum(racks.door_effectiveness, 0.0)
-    capture = np.where(door > 0.0, door, racks.capture_other)
-    return np.asarray(racks.capture_chip * chips_w + capture * racks.other_max_w)

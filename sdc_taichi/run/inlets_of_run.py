@@ -90,9 +90,7 @@ def inlets_at_step(run: RunFolder, dc: int, step: int, *, allow_code: bool = Fal
         return InletsAtStep(step, float(result.inlet_max_c[0]), sim.fleet.configs[0], inlets)
 
 
-def junction_at_step(
-    run: RunFolder, dc: int, step: int, rack: int | None, *, allow_code: bool = False
-) -> JunctionParts:
+def junction_at_step(run: RunFolder, dc: int, step: int, rack: int | None) -> JunctionParts:
     """Split a junction temperature by simulating the run again, as ``inlets_at_step`` does.
 
     Args:
@@ -100,18 +98,17 @@ def junction_at_step(
         dc: Index of the data center.
         step: Index of the step, counted from 0 at reset.
         rack: Index of the rack in its data center; None is that of the hottest junction.
-        allow_code: True if the run's controller may be an import path.
 
     Raises:
         SdcError: As ``inlets_at_step``, or the rack has no cold plates.
     """
-    with _simulated_to(run, dc, step, allow_code=allow_code) as (sim, _):
+    with _simulated_to(run, dc, step) as (sim, _):
         return sim.junction_parts(rack)
 
 
 @contextlib.contextmanager
 def _simulated_to(
-    run: RunFolder, dc: int, step: int, *, allow_code: bool
+    run: RunFolder, dc: int, step: int, *, allow_code: bool = False
 ) -> Iterator[tuple[Simulator, StepResult]]:
     """Simulate a data center of a run alone up to a step; give simulator and result of the step."""
     metrics = run.metrics
