@@ -84,9 +84,6 @@ class OddInputWarning(SdcWarning):
 def place_in_user_code(error: BaseException) -> str:
     """Return ``FILE:LINE`` of the innermost call of an error in code that the package called.
 
-    Args:
-        error: the error, with its traceback.
-
     Returns:
         The place; empty if the error passed through no function of a user.
     """
@@ -106,12 +103,6 @@ def place_in_user_code(error: BaseException) -> str:
 def whole_number(what: str, value: object, low: int, high: int) -> int:
     """Check an integer argument, and return it as a Python ``int``.
 
-    Args:
-        what: name of the argument, for the message.
-        value: the argument, an integer of Python or NumPy.
-        low: smallest valid value.
-        high: largest valid value.
-
     Raises:
         ConfigError: the value is not an integer, or out of bounds.
     """
@@ -124,12 +115,7 @@ def whole_number(what: str, value: object, low: int, high: int) -> int:
 
 
 def shortened(value: object, most: int = 80) -> str:
-    """Return the ``repr`` of a value for a message, cut to a number of characters.
-
-    Args:
-        value: any value.
-        most: largest number of characters before the cut.
-    """
+    """Return the ``repr`` of a value for a message, cut to a number of characters."""
     text = repr(value[: most + 1] if isinstance(value, str | bytes | list | tuple) else value)
     return text if len(text) <= most else text[:most] + "…"
 

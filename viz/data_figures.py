@@ -137,10 +137,6 @@ def mean_and_variation(name: str, values: pd.Series) -> tuple[float, float]:
 
     The coefficient of variation (standard deviation divided by mean) is averaged over the days.
 
-    Args:
-        name: name of the series, for error messages.
-        values: values by time.
-
     Raises:
         SdcError: the mean of a day is not positive.
     """

@@ -150,15 +150,7 @@ def clock_text(result: StepResult, fleet: Fleet, dc: int) -> str:
 
 
 def draw_hall(axes: Axes, quantity: str, result: StepResult, fleet: Fleet, dc: int) -> None:
-    """Draw the inlet or outlet temperature of each rack of a hall, as numbers too in small halls.
-
-    Args:
-        axes: axes to draw in.
-        quantity: ``inlet`` or ``outlet``.
-        result: result of one step.
-        fleet: the fleet of the result.
-        dc: index of the data center.
-    """
+    """Draw the inlet or outlet temperatures of racks of a hall, also as numbers in small halls."""
     from matplotlib.ticker import MaxNLocator
 
     hall = fleet.configs[dc].hall
@@ -328,12 +320,7 @@ def optimum_day(
 
 
 def day_of_most_saved(saved: F64, times: pd.Series) -> str:
-    """Return the day with the largest saving, YYYY-MM-DD; the earliest on a tie.
-
-    Args:
-        saved: saving in each step, in any unit.
-        times: times at which the steps begin.
-    """
+    """Return the day with the largest saving, YYYY-MM-DD; the earliest on a tie."""
     days = times.dt.strftime("%Y-%m-%d").to_numpy()
     names, of_step = np.unique(days, return_inverse=True)
     # Sums are compared after rounding, because equal days may differ by rounding errors.

@@ -117,9 +117,6 @@ def floor_plan_figure(
 def places_figure(study: RackPlaces) -> Figure:
     """Draw the floor plan of a hall with new racks at the best candidate, marked by crosses.
 
-    Args:
-        study: result of ``study_places``.
-
     Raises:
         SdcError: matplotlib is missing, or the hall has no solution at its design point.
     """
@@ -169,9 +166,6 @@ def failover_figure(study: Failover) -> Figure:
     curves show the hottest inlet of the hall after each of the worst losses. Studies of liquid
     cooling show junctions if there are some, and on the floor plan the hottest minute, because
     junctions cool once racks have tripped.
-
-    Args:
-        study: result of ``study_failover``.
 
     Raises:
         SdcError: matplotlib is missing.

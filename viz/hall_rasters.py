@@ -109,9 +109,6 @@ def rack_numbers(grid: TileGrid) -> npt.NDArray[np.uint16]:
 def colour_bar(scale: ColourScale) -> tuple[Classes, list[float]]:
     """Return the image of a colour bar, and the values of its tick marks.
 
-    Args:
-        scale: the colour scale.
-
     Returns:
         Classes of a horizontal gradient over the range, (height, width), and at most nine round
         values within the range.

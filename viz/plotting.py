@@ -228,10 +228,6 @@ def with_local_time(steps: pd.DataFrame) -> pd.DataFrame:
 def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> pd.DataFrame:
     """Check that a DataFrame contains the steps of one data center; return it in local time.
 
-    Args:
-        steps: one row per step.
-        columns: names of the required columns.
-
     Raises:
         SdcError: a column is missing, there are fewer than two rows, or the times do not increase.
     """

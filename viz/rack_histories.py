@@ -40,12 +40,7 @@ class RackValues(NamedTuple):
 
 
 class RackHistory:
-    """Collects the values of the R racks of a data center, step by step.
-
-    Args:
-        fleet: the fleet.
-        dc: index of the data center.
-    """
+    """Collects the values of the R racks of a data center, step by step."""
 
     def __init__(self, fleet: Fleet, dc: int) -> None:
         first, last = fleet.rack_offsets[dc : dc + 2].tolist()
@@ -79,9 +74,6 @@ class RackHistory:
     def at(self, step: int) -> RackValues | None:
         """Return the values of all racks at a step, or the highest of the steps kept with it.
 
-        Args:
-            step: the step, counted from 0 at reset.
-
         Returns:
             Values at one time, (1, R) each; None if the step is not in the history.
         """
@@ -104,11 +96,7 @@ class RackHistory:
         return None if values is None else values.inlet_c[0]
 
     def of_racks(self, racks: I64) -> RackValues:
-        """Return the values of racks of the hall at all times.
-
-        Args:
-            racks: indices of the racks in the hall.
-        """
+        """Return the values of racks of the hall at all times."""
         self._reduce()
         rest = [np.maximum.reduce(self._pending)] if self._pending else []
         numbers = np.stack([frame[:, racks] for frame in [*self._numbers, *rest]], axis=1)

@@ -122,9 +122,6 @@ class CloseUps:
 
     A pixel is as wide as a rack and half as deep: a rack has one pixel for its front and one for
     its back. Aisles are rounded to half a rack's depth.
-
-    Args:
-        hall: config of the hall.
     """
 
     def __init__(self, hall: HallConfig) -> None:

@@ -77,10 +77,6 @@ def class_image(hall: HallConfig, datatype: Literal["U8", "U16"]) -> Any:
     """Return the static components of an image of the classes of racks, with a pixel per rack.
 
     The image covers the tiles of the heat maps.
-
-    Args:
-        hall: config of the hall.
-        datatype: type of the classes.
     """
     grid = tile_grid(hall)
     pixel = grid.tile_width + grid.gap, grid.tile_height + grid.gap

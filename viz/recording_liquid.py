@@ -89,11 +89,7 @@ the diagram. The viewer draws a label of one line below each point."""
 
 
 def liquid_plots(*, has_junctions: bool) -> dict[str, Plot]:
-    """Return the plots of the loops of a data center by entity.
-
-    Args:
-        has_junctions: True for a data center with cold plates.
-    """
+    """Return the plots of the loops of a data center by entity."""
     return {name: x for name, x in LIQUID_PLOTS.items() if has_junctions or name != "junction_c"}
 
 

@@ -355,10 +355,6 @@ class _BackgroundCall(threading.Thread):
     """Function call in a separate thread, for functions that may never return.
 
     After a write error, a flush of Rerun may never return, regardless of its timeout.
-
-    Args:
-        call: the function.
-        arguments: arguments of the function.
     """
 
     def __init__(self, call: Callable[..., object], *arguments: object) -> None:

@@ -211,14 +211,7 @@ def down_texts(down: Sequence[Sequence[int]]) -> Any:
 
 
 class HottestRow:
-    """Picture of the inlets of the row with the hottest inlet, by time and rack.
-
-    Args:
-        path: path of the entities of the picture.
-        history: history of the racks of the hall.
-        hall: the hall.
-        scale: colour scale of inlets.
-    """
+    """Picture of the inlets of the row with the hottest inlet, by time and rack."""
 
     def __init__(
         self, path: str, history: RackHistory, hall: HallConfig, scale: ColourScale

@@ -46,12 +46,7 @@ def state_classes(status: Status, active: Sequence[ActiveEvent]) -> npt.NDArray[
 
 
 class StatePictures:
-    """Map of the states of the racks of one data center, recorded when they change.
-
-    Args:
-        sim: the simulator.
-        dc: index of the data center.
-    """
+    """Map of the states of the racks of one data center, recorded when they change."""
 
     def __init__(self, sim: Simulator, dc: int) -> None:
         fleet = sim.fleet

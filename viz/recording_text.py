@@ -123,12 +123,7 @@ class _Ongoing:
 
 
 class ConditionLog:
-    """Finds the steps at which conditions of a data center begin and end, block by block.
-
-    Args:
-        fleet: the fleet.
-        dc: index of the data center.
-    """
+    """Finds the steps at which conditions of a data center begin and end, block by block."""
 
     def __init__(self, fleet: Fleet, dc: int) -> None:
         config = fleet.configs[dc]

@@ -459,13 +459,7 @@ def data_center_entities(
 
 
 def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]) -> Entities:
-    """Yield the static entities of the maps of a hall: classes, colour bars, names of racks.
-
-    Args:
-        hall: the hall.
-        path: path of the data center in the recording.
-        scales: colour scales of the maps, keyed by quantity.
-    """
+    """Yield the static entities of the maps of a hall: classes, colour bars, names of racks."""
     grid = rasters.tile_grid(hall)
     height, width = grid.image_shape
     for quantity, scale in scales.items():
@@ -490,13 +484,7 @@ def _map_entities(hall: HallConfig, path: str, scales: Mapping[str, ColourScale]
 
 
 def scale_entities(path: str, quantity: str, scale: ColourScale) -> Entities:
-    """Yield the static entities of the colours of a map: its classes, and its colour bar.
-
-    Args:
-        path: path of the data center in the recording.
-        quantity: quantity of the map.
-        scale: colour scale of the map.
-    """
+    """Yield the static entities of the colours of a map: its classes, and its colour bar."""
     yield f"{path}/map/{quantity}", annotation_context(scale)
     yield from _colour_bar(f"{path}/legend/{quantity}", scale)
 
@@ -508,15 +496,7 @@ def _hall_entities(
     levels: int,
     units: int,
 ) -> Entities:
-    """Yield the static entities of a 3D hall: voxels, walls, row labels and CRAC units.
-
-    Args:
-        fleet: the fleet.
-        dc: index of the data center.
-        path: path of the hall in the recording.
-        levels: number of levels per rack.
-        units: number of CRAC units.
-    """
+    """Yield the static entities of a 3D hall: voxels, walls, row labels and CRAC units."""
     hall = fleet.configs[dc].hall
     grid = rasters.rack_voxels(hall, levels)
     for quantity, cells in (("inlet", grid.front), ("outlet", grid.back)):
@@ -560,10 +540,6 @@ def _colour_bar(path: str, scale: ColourScale) -> Entities:
     """Yield the entities of a colour bar: a gradient, and points labelled with values.
 
     The viewer has no colour bars of its own.
-
-    Args:
-        path: path of the colour bar.
-        scale: the colour scale.
     """
     gradient, ticks = rasters.colour_bar(scale)
     height, width = gradient.shape

@@ -87,12 +87,7 @@ def zone_pixels(zones: Zones) -> npt.NDArray[np.float64]:
 
 
 class ZonePictures:
-    """Map of the zones of one data center, and the racks of each zone.
-
-    Args:
-        sim: the simulator.
-        dc: index of the data center.
-    """
+    """Map of the zones of one data center, and the racks of each zone."""
 
     def __init__(self, sim: Simulator, dc: int) -> None:
         fleet = sim.fleet

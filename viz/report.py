@@ -330,10 +330,6 @@ def events_section(run: RunFolder) -> list[Block]:
 def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> list[Block]:
     """Return the section that explains the inlet temperatures of the hottest racks.
 
-    Args:
-        run: the run.
-        dcs: indices of the data centers.
-
     Raises:
         SdcError: steps.parquet is damaged.
     """

@@ -58,12 +58,7 @@ def comparison_section(
 
 
 def difference_rows(comparison: Comparison, columns: Sequence[int]) -> list[list[str]]:
-    """Return a row of cells for each field or input in which runs differ.
-
-    Args:
-        comparison: the comparison.
-        columns: indices of the runs.
-    """
+    """Return a row of cells for each field or input in which runs differ."""
     return [
         [
             f"{each.name}: {each.meaning}" if each.meaning else each.name,

@@ -206,13 +206,7 @@ def first_texts(texts: Sequence[str]) -> list[str]:
 
 
 def local_time(run: RunFolder, dc: int, step: int) -> datetime:
-    """Return the time at which a step begins, on the clock of a data center.
-
-    Args:
-        run: the run.
-        dc: index of the data center.
-        step: the step, counted from 0 at reset.
-    """
+    """Return the time at which a step begins, on the clock of a data center."""
     per_hour = round(1 / run.metrics["step_h"])
     first_day = day_of_year(run.metrics["data_centers"][dc]["start"])
     start = np.array([first_day * 24 * per_hour])

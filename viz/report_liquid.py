@@ -68,12 +68,7 @@ def liquid_section(run: RunFolder, dc: ShownDataCenter) -> list[Block]:
 
 
 def _figures(steps: pd.DataFrame, step_h: float) -> dict[str, str]:
-    """Return the key figures of liquid cooling over a run, by label.
-
-    Args:
-        steps: steps of the data center.
-        step_h: length of a step, in h.
-    """
+    """Return the key figures of liquid cooling over a run, by label."""
     columns = ("it_w", "overhead_w", "it_fan_w", "reuse_w", "liquid_heat_w")
     it_kwh, overhead_kwh, fan_kwh, reuse_kwh, liquid_kwh = (
         float(steps[name].sum()) * step_h / 1e3 for name in columns

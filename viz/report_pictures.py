@@ -325,12 +325,7 @@ def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> list[Blo
 
 
 def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dict[str, pd.Series]:
-    """Return series keyed by the names of data centers, joined if their series are equal.
-
-    Args:
-        names: names of the data centers.
-        all_series: series of each data center.
-    """
+    """Return series keyed by the names of data centers, joined if their series are equal."""
     groups: list[tuple[list[str], pd.Series]] = []
     for name, values in zip(names, all_series, strict=True):
         same = next((group for group, series in groups if series.equals(values)), None)
@@ -375,13 +370,7 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
 def optimum_section(
     run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]
 ) -> list[Block]:
-    """Return the section of an optimum: its table, and pictures of the day of largest saving.
-
-    Args:
-        run: the run.
-        optimum: an optimum for the inputs of the run.
-        shown: data centers with pictures.
-    """
+    """Return the section of an optimum: its table, and pictures of the day of largest saving."""
     content = optimum.content
     of_run = remarks_beside(run.metrics) if _beside_optimum(run, content) is not None else []
     remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *of_run])))
@@ -440,10 +429,6 @@ def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, 
 
     None means that there is no such entry, or that it has another objective, other agents or
     another first scored step.
-
-    Args:
-        run: the run.
-        content: content of optimum.json.
     """
     entry = run.metrics.get("optimum")
     if entry is None:
@@ -499,11 +484,6 @@ def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> 
 
     If the run is that of the optimum, the picture shows the day on which the battery moves most
     energy.
-
-    Args:
-        run: the run.
-        optimum: an optimum for the inputs of the run.
-        dc: the data center.
     """
     name = run.names[dc.index]
     objective = str(optimum.content["objective"])

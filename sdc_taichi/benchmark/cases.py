@@ -38,12 +38,7 @@ def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
 
 
 def number_of_weeks(case: Case, part: Part) -> int:
-    """Return the number of weeks of a part of a case, summed over its data centers and years.
-
-    Args:
-        case: the case.
-        part: ``held-out`` or ``validation``.
-    """
+    """Return the number of weeks of a part of a case, summed over its data centers and years."""
     places = _settings_of_data_centers(case, part).places
     return places * max(len(years_of(case, part)), 1) * len(weeks_of(case, part))
 
@@ -59,22 +54,12 @@ def _settings_of_data_centers(case: Case, part: Part) -> TrainingSettings:
 
 
 def weeks_of(case: Case, part: Part) -> tuple[int, ...]:
-    """Return the weeks of the year, 0..51, of a part of a case.
-
-    Args:
-        case: the case.
-        part: ``held-out`` or ``validation``.
-    """
+    """Return the weeks of the year, 0..51, of a part of a case."""
     return case.weeks if part == "held-out" else case.validation_weeks
 
 
 def years_of(case: Case, part: Part) -> tuple[int, ...]:
-    """Return the seeds of the synthetic years of a part of a case; empty for that of the sites.
-
-    Args:
-        case: the case.
-        part: ``held-out`` or ``validation``.
-    """
+    """Return the seeds of the synthetic years of a part of a case; empty for that of the sites."""
     return (case.test.years if part == "held-out" else case.validation_years) or case.years
 
 
@@ -138,11 +123,7 @@ def training_steps(training: Mapping[str, Any], train: Mapping[str, Any]) -> int
 
 
 def agents_of(settings: TrainingSettings) -> tuple[str, ...]:
-    """Return the names of the agents that learn in a training.
-
-    Args:
-        settings: settings of the training.
-    """
+    """Return the names of the agents that learn in a training."""
     return tuple(settings.environment.agents or AGENTS)
 
 
@@ -150,11 +131,6 @@ def number_of_seeds(suite: Suite, case: str, row: str) -> int:
     """Return the number of seeds of a row in a case; 1 if neither row nor case is random.
 
     A case is random if it samples events or has errors of forecasts, which optima do not have.
-
-    Args:
-        suite: the suite.
-        case: name of the case.
-        row: name of the row.
     """
     chosen = suite.rows[row]
     if chosen.seeds is not None:
@@ -168,9 +144,6 @@ def number_of_seeds(suite: Suite, case: str, row: str) -> int:
 
 def check_suite(suite: Suite) -> None:
     """Check a suite completely before any job runs.
-
-    Args:
-        suite: the suite.
 
     Raises:
         ConfigError: data centers, controllers or training settings are not valid; the message names

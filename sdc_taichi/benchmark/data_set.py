@@ -108,11 +108,7 @@ def returns_of(episodes: Iterable[dict[str, Any]]) -> pd.DataFrame:
 
 
 def figures_of(episode: Episode) -> dict[str, Any]:
-    """Return controller, return, number of steps and summed quantities of an episode.
-
-    Args:
-        episode: the episode.
-    """
+    """Return controller, return, number of steps and summed quantities of an episode."""
     return {
         "controller": episode.controller,
         "mean_return": float(episode.rewards.sum()),

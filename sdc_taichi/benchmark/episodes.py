@@ -136,11 +136,7 @@ class Collection:
         )
 
     def make_batch(self, size: int) -> SdcVectorEnv:
-        """Create a batch of environments of equal data centers.
-
-        Args:
-            size: number of environments, B.
-        """
+        """Create a batch of environments of equal data centers."""
         return SdcVectorEnv(
             size,
             self.config,
@@ -343,11 +339,7 @@ def objective_of_optimum(name: str) -> Objective | None:
 
 
 class _Chance:
-    """Uniformly random actions, from a separate random generator for each environment.
-
-    Args:
-        env: batch of environments.
-    """
+    """Uniformly random actions, from a separate random generator for each environment."""
 
     def __init__(self, env: SdcVectorEnv) -> None:
         self._spaces = [deepcopy(env.single_action_space) for _ in range(env.num_envs)]

@@ -52,11 +52,7 @@ def _pace_of(case_text: str) -> _Pace:
 
 
 def core_s_of(job: Job) -> float:
-    """Return the expected processor time of a job, in s.
-
-    Args:
-        job: a job of a suite.
-    """
+    """Return the expected processor time of a job, in s."""
     values = job.values
     case = Case.model_validate(values["case"])
     pace = _pace_of(case.model_dump_json())

@@ -188,20 +188,13 @@ def check_file_name(name: str) -> None:
 
 
 def input_paths(config: DataCenterConfig) -> list[str]:
-    """Return the paths of all input files in a configuration, without duplicates.
-
-    Args:
-        config: the configuration.
-    """
+    """Return the paths of all input files in a configuration, without duplicates."""
     named = (value_at(config, name) for name in FILE_FIELDS)
     return list(dict.fromkeys(path for path in named if path is not None))
 
 
 def read_input(path: str) -> bytes:
     """Read an input file.
-
-    Args:
-        path: path of the file.
 
     Raises:
         SdcError: the file cannot be read, or is too large.
@@ -256,11 +249,7 @@ def _packed(result: JobResult, job: Job) -> dict[str, Any]:
 
 
 def parquet(rows: pd.DataFrame) -> bytes:
-    """Return table rows as the content of a Parquet file, independent of the version of pandas.
-
-    Args:
-        rows: the table rows.
-    """
+    """Return table rows as the content of a Parquet file, independent of the version of pandas."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

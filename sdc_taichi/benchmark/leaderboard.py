@@ -135,11 +135,7 @@ class Leaderboard:
 
 
 def leaderboard(case: CaseResults) -> Leaderboard:
-    """Compute all tables that compare the rows of a case.
-
-    Args:
-        case: results of the case.
-    """
+    """Compute all tables that compare the rows of a case."""
     evaluation = evaluation_of(case)
     figures = samples(evaluation)
     changes = {name: float(change_pct(*pair)) for name, pair in figures.items()}

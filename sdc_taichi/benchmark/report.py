@@ -124,12 +124,7 @@ def write_report(
 
 
 def markdown_report(title: str, sections: Sections) -> str:
-    """Return a report as Markdown, without pictures.
-
-    Args:
-        title: heading of the report.
-        sections: sections of the report.
-    """
+    """Return a report as Markdown, without pictures."""
     parts = [f"# {literal_markdown(title)}"]
     for heading, blocks in sections.items():
         parts.append(f"## {literal_markdown(heading)}")
@@ -207,11 +202,7 @@ def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> lis
 
 
 def cost_text(suite: SuiteResults) -> str:
-    """Return a sentence with the processor time of the results of a suite.
-
-    Args:
-        suite: results of the suite.
-    """
+    """Return a sentence with the processor time of the results of a suite."""
     results = suite.results
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
     whole_h = sum(x.record.core_s for x in results) / 3600
@@ -236,11 +227,7 @@ def _overview(boards: Mapping[str, Leaderboard]) -> str:
 
 
 def suite_notes(suite: SuiteResults) -> list[str]:
-    """Return notes on the results of a suite, such as missing results.
-
-    Args:
-        suite: results of the suite.
-    """
+    """Return notes on the results of a suite, such as missing results."""
     results = suite.results
     notes = []
     if suite.quick:
@@ -343,11 +330,7 @@ def _outage_notes(board: Leaderboard) -> list[str]:
 
 
 def weeks_text(board: Leaderboard) -> str:
-    """Return a sentence with objective, weeks and sites of a case.
-
-    Args:
-        board: tables of the case.
-    """
+    """Return a sentence with objective, weeks and sites of a case."""
     first = next(iter(board.case.rows.values()))[0].frame
     sites, years, weeks = (list(dict.fromkeys(first[name])) for name in PLACE)
     objective = board.case.objective
@@ -387,11 +370,7 @@ def _recordings(case: CaseResults, folder: Path) -> list[str]:
 
 
 def case_pictures(board: Leaderboard) -> list[Picture]:
-    """Return the pictures of a case.
-
-    Args:
-        board: tables of the case.
-    """
+    """Return the pictures of a case."""
     pictures: list[Picture] = []
     if picture := _interval_picture(board):
         pictures.append(picture)

@@ -435,10 +435,6 @@ def partition_path(partition: Mapping[str, str]) -> Path:
 def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
     """Read a JSON file with a known format.
 
-    Args:
-        path: path of the file.
-        model: class of the format.
-
     Raises:
         ConfigError: the file cannot be read, or has a different format.
     """
@@ -457,10 +453,6 @@ def read_record(path: Path, model: type[AnyRecord]) -> AnyRecord:
 
 def write_record(path: Path, record: Record) -> None:
     """Write a JSON file atomically.
-
-    Args:
-        path: path of the file.
-        record: content of the file.
 
     Raises:
         SdcError: the file cannot be written.

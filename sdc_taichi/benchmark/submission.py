@@ -84,9 +84,6 @@ class Submission:
 def read_submission(folder: Path) -> Submission:
     """Read the folder of a submitted row and check its schema.
 
-    Args:
-        folder: the folder.
-
     Raises:
         SdcError: files are missing or damaged, have a different format or version of the package,
             or belong to several rows.

@@ -160,12 +160,7 @@ def _extracted(inputs: Inputs, task: _Task, scratch: Path) -> Path:
 
 
 def packed(files: Mapping[str, bytes], metrics: Mapping[str, Any]) -> bytes:
-    """Return metrics and files of a job as a reproducible ZIP archive, for use as an input.
-
-    Args:
-        files: content of each file by name.
-        metrics: metrics of the job.
-    """
+    """Return metrics and files of a job as a reproducible ZIP archive, for use as an input."""
     contents = {**files, METRICS_FILE: json.dumps(metrics, sort_keys=True).encode()}
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:

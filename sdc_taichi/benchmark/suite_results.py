@@ -207,9 +207,6 @@ class SuiteResults:
 def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
     """Read the results of suites; results of a suite in several folders are combined.
 
-    Args:
-        folders: folders of studies.
-
     Raises:
         SdcError: a folder contains no study of a suite, a result is damaged, or results differ in
             their weeks or data centers.
@@ -222,9 +219,6 @@ def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
 
 def suite_of(store: ResultStore) -> Suite:
     """Return the suite of a study.
-
-    Args:
-        store: storage of the study.
 
     Raises:
         ConfigError: the study is not a run of a suite, or its suite is not valid.
@@ -261,9 +255,6 @@ def evaluation_of(case: CaseResults) -> Evaluation:
 
     Runs of single agents are included, except for those of the optimum, whose objective values
     become ``Evaluation.alone`` and ``Evaluation.uncoordinated``.
-
-    Args:
-        case: results of the case.
     """
     import pandas as pd
 
@@ -293,9 +284,6 @@ def evaluation_of(case: CaseResults) -> Evaluation:
 def check_partition(partition: Mapping[str, str]) -> None:
     """Check that a partition can identify a result of a suite.
 
-    Args:
-        partition: columns and values.
-
     Raises:
         ConfigError: the columns are not ``COLUMNS``, or the seed is not a whole number.
     """
@@ -314,11 +302,6 @@ def check_weeks(
     case: str, weeks_of_case: Sequence[int], rows: Mapping[str, Sequence[RowResult]]
 ) -> None:
     """Check that all rows of a case have the same weeks of the same data centers.
-
-    Args:
-        case: name of the case.
-        weeks_of_case: weeks of the year of the case.
-        rows: results of each row by seed.
 
     Raises:
         ConfigError: the weeks differ, or the objective of idle commands differs for equal seeds.

@@ -44,14 +44,7 @@ class RunStage(Protocol):
     def __call__(
         self, stage: str, jobs: Sequence[Job], total: int, inputs: Inputs | None = None, /
     ) -> JobSummary:
-        """Run the jobs of a stage.
-
-        Args:
-            stage: name of the stage.
-            jobs: the jobs.
-            total: number of jobs.
-            inputs: content of inputs by name.
-        """
+        """Run the jobs of a stage."""
         ...
 
 
@@ -74,11 +67,7 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
 
 
 def planned_jobs(suite: Suite) -> list[Job]:
-    """Return all jobs of a suite: optima, trials of settings, and rows.
-
-    Args:
-        suite: the suite.
-    """
+    """Return all jobs of a suite: optima, trials of settings, and rows."""
     references = reference_jobs(suite)
     trials = trial_jobs(suite, references)
     return [*references, *trials, *row_jobs(suite, references, trials)]
@@ -88,9 +77,6 @@ def reference_jobs(suite: Suite) -> list[Job]:
     """Return the jobs that compute the optima of a suite, one for each case, part, site and year.
 
     Cases with the same optima, such as those with other forecasts, share the jobs of the first.
-
-    Args:
-        suite: the suite.
     """
     jobs: dict[str, Job] = {}
     for name in suite.cases:

@@ -176,10 +176,6 @@ def combinations(sweep: Sweep) -> Iterator[tuple[Any, ...]]:
 def check_sweep(sweep: Sweep, most_runs: int = MOST_RUNS) -> None:
     """Check that a sweep can begin; single combinations can still fail later.
 
-    Args:
-        sweep: the sweep.
-        most_runs: maximum number of runs.
-
     Raises:
         SdcError: the sweep has too many runs, options contradict each other, or none of the first
             combinations is valid.
@@ -349,12 +345,7 @@ def check_part(values: Mapping[str, Any], metrics: Mapping[str, Any], rows: byte
 
 
 def stored_metrics(store: ResultStore, jobs: Iterable[Job]) -> Iterator[tuple[int, PartMetrics]]:
-    """Yield number of runs and metrics of each job of a sweep that has a valid result.
-
-    Args:
-        store: storage of the results.
-        jobs: jobs of the sweep.
-    """
+    """Yield number of runs and metrics of each job of a sweep that has a valid result."""
     for job in jobs:
         try:
             metrics = store.result(job.partition).metrics

@@ -41,11 +41,7 @@ class JobsCommand(typer.core.TyperCommand):
 
 
 def with_ray_address(args: list[str]) -> list[str]:
-    """Insert ``local`` after each ``--ray`` that is not followed by an address.
-
-    Args:
-        args: arguments of a command line.
-    """
+    """Insert ``local`` after each ``--ray`` that is not followed by an address."""
     end = args.index("--") if "--" in args else len(args)
     words: list[str] = []
     for i, (word, after) in enumerate(zip_longest(args, args[1:], fillvalue="")):

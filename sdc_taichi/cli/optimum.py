@@ -332,12 +332,7 @@ def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:
 
 
 def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
-    """Print the table of figures of an optimum, and remarks about them.
-
-    Args:
-        content: content of optimum.json.
-        steps_per_hour: number of steps in an hour.
-    """
+    """Print the table of figures of an optimum, and remarks about them."""
     from sdc_taichi.optimum.uncoordinated import title_of
     from sdc_taichi.run.optimum_folder import optimum_remarks
 

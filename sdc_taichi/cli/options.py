@@ -112,9 +112,6 @@ def completed_by(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str
     """Return a function that completes a word of the command line to names that begin with it.
 
     If no name begins with the word, shells offer files.
-
-    Args:
-        names: function that returns all names.
     """
 
     def complete(incomplete: str) -> list[str]:

@@ -230,10 +230,6 @@ def _default_folder(label: str, sweep: Sweep) -> Path:
 def _print_failures(store: ResultStore, jobs: Iterable[Job]) -> tuple[int, int]:
     """Print the distinct reasons for failed runs on stderr.
 
-    Args:
-        store: folder of the results of the sweep.
-        jobs: jobs of the sweep.
-
     Returns:
         Number of runs with results, and number of failed runs in finished jobs.
     """

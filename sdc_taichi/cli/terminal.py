@@ -233,10 +233,6 @@ def exit_if_stopped() -> Iterator[None]:
 def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], None]]:
     """Show the progress of a simulation run on stderr, if that is a terminal.
 
-    Args:
-        steps: number of steps of the run.
-        shown: True to show progress.
-
     Yields:
         A function to call with the result of every step.
     """
@@ -261,9 +257,6 @@ class StageProgress(Protocol):
 @contextlib.contextmanager
 def stage_bars(*, shown: bool) -> Iterator[StageProgress]:
     """Show a progress bar for each stage of some work on stderr, if that is a terminal.
-
-    Args:
-        shown: True to show progress bars.
 
     Yields:
         The progress callback.

@@ -95,9 +95,6 @@ class Rewards:
     def reset(self, view: View) -> None:
         """Start an episode.
 
-        Args:
-            view: the view before the first step.
-
         Raises:
             DataError: the carbon intensity is constant, so it cannot scale a reward of the paper.
         """

@@ -120,9 +120,6 @@ def commented_yaml(config: DataCenterConfig) -> str:
     """Return a configuration as YAML with a comment above each field.
 
     ``load_config`` reads the text back as an equal configuration.
-
-    Args:
-        config: The configuration.
     """
     lines = _commented(config.model_dump(mode="json"), DataCenterConfig, "")
     return "\n".join(lines).replace("``", "`") + "\n"

@@ -86,11 +86,7 @@ FileName = Annotated[str, Field(min_length=1)]
 
 
 class NameIn:
-    """Annotation of a text field whose value must be a name in a registry of models.
-
-    Args:
-        registry: Models by their names.
-    """
+    """Annotation of a text field whose value must be a name in a registry of models."""
 
     def __init__(self, registry: Mapping[str, object]) -> None:
         self._registry = registry

@@ -94,10 +94,6 @@ class GreedyLoops(WithoutMemory):
 def require_liquid(name: str, fleet: Fleet) -> None:
     """Refuse a controller of liquid-cooled racks for data centers without them.
 
-    Args:
-        name: name of the controller.
-        fleet: the data centers.
-
     Raises:
         ConfigError: a data center has no liquid-cooled racks.
     """

@@ -363,12 +363,7 @@ def trim_and_respond(
 
 
 def slots_in_step(step: int, step_h: float) -> int:
-    """Return the number of intervals of trim and respond that end within a step.
-
-    Args:
-        step: Number of the step, from 0.
-        step_h: Length of a step, h.
-    """
+    """Return the number of intervals of trim and respond that end within a step."""
     minutes = round(step_h * 60.0)
     return int((step + 1) * minutes // SLOT_MIN - step * minutes // SLOT_MIN)
 

@@ -50,9 +50,6 @@ class UnitZones:
     A rack is in the zone of the running unit with the largest share of its supply air. A unit that
     has no rack this way has the rack of which it feeds the largest share. A unit that is down keeps
     the zone that it has when all units run, and its racks are in zones of other units as well.
-
-    Args:
-        fleet: The data centers.
     """
 
     def __init__(self, fleet: Fleet) -> None:

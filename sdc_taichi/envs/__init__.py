@@ -23,9 +23,6 @@ def register(gymnasium: ModuleType) -> None:
 
     ``gymnasium.make`` imports the environments. The length of an episode depends on the arguments,
     so each environment sets ``max_episode_steps`` in its own spec (``sdc_taichi.envs.base``).
-
-    Args:
-        gymnasium: the module ``gymnasium``.
     """
     for name, agent in IDS.items():
         if name not in gymnasium.registry:

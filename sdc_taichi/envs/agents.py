@@ -229,9 +229,6 @@ def present_agents(agents: Sequence[str]) -> tuple[str, ...]:
     """Return the groups that exist beside those that learn, and these, in order.
 
     ``crac`` and ``plant`` take the place of ``agent_dc`` where one of them learns.
-
-    Args:
-        agents: names of the groups that learn.
     """
     absent = ("agent_dc",) if set(agents) & set(HALL_AGENTS) else HALL_AGENTS
     return tuple(agent for agent in ALL_AGENTS if agent in agents or agent not in absent)

@@ -242,9 +242,6 @@ class Core:
     def _build(self, configs: Sequence[DataCenterConfig]) -> None:
         """Create simulator, controller of other agents, observer and decoder of data centers.
 
-        Args:
-            configs: config of each environment.
-
         Raises:
             SdcError: a config does not fit the others or the options.
         """

@@ -107,10 +107,6 @@ def frame(view: View, env: int) -> Image:
     """Draw the hall of one environment after the last step, (height, width, 3).
 
     Before the first step all inlets are at the mean setpoint.
-
-    Args:
-        view: the controller's view before the next step.
-        env: index of the environment in its batch.
     """
     fleet = view.fleet
     hall = fleet.configs[env].hall

@@ -156,11 +156,7 @@ class Observer:
         self._entries: _Entries | None = None
 
     def reset(self, view: View) -> None:
-        """Start an episode.
-
-        Args:
-            view: the view before the first step.
-        """
+        """Start an episode."""
         self._time.reset(view)
         if view.sizing is not self._sizing:
             self._compile(view)

@@ -334,10 +334,6 @@ Overrides: TypeAlias = Mapping[str, Any] | Sequence[str]
 class ConfigDraw:
     """Draws the config of each environment and episode.
 
-    Args:
-        draw: function that draws a config.
-        overrides: values that replace those of every config.
-
     Attributes:
         most_units: largest number of CRAC units of a config; None if ``draw`` does not say.
     """

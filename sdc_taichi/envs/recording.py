@@ -99,9 +99,6 @@ class EpisodeRecordings:
         If the recording cannot be opened, the first episode fails. A later episode continues
         without a recording after a ``RecordingWarning``.
 
-        Args:
-            sim: the simulator of the batch.
-
         Raises:
             SdcError: the recording of the first episode cannot be opened.
         """

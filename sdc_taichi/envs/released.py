@@ -170,9 +170,6 @@ class ReleasedObserver:
     bulb to 0..45 C. The scaled value of an input that is constant for the 30 days from the first
     step is 0. Entries are clipped to the ranges in ``FEATURES``.
 
-    Args:
-        agents: agents whose vectors ``observe`` returns.
-
     Attributes:
         features: entries of each agent's vector, in order.
         spaces: space of each agent's vector.
@@ -189,11 +186,7 @@ class ReleasedObserver:
         self._observed: tuple[View, dict[str, F64]] | None = None
 
     def reset(self, view: View) -> None:
-        """Start an episode: compute the ranges that scale the inputs.
-
-        Args:
-            view: the controller's view before the first step.
-        """
+        """Start an episode: compute the ranges that scale the inputs."""
         per_hour, drivers = view.fleet.steps_per_hour, view.drivers
         window = SCALING_DAYS * 24 * per_hour
         if self._ci is None or not self._ci.is_made_of(drivers.ci_g_per_kwh):
@@ -513,9 +506,6 @@ class ReleasedRewards:
 
     def reset(self, view: View) -> None:
         """Start an episode: compute the ranges of power and carbon intensity.
-
-        Args:
-            view: the controller's view before the first step.
 
         Raises:
             DataError: the carbon intensity of a data center is constant, so it has no range.

@@ -103,11 +103,7 @@ class TermContext:
         self._means: dict[str, tuple[FleetSeries, FleetSeries]] = {}
 
     def reset(self, view: View) -> None:
-        """Start an episode.
-
-        Args:
-            view: the view before the first step.
-        """
+        """Start an episode."""
         per_hour = view.fleet.steps_per_hour
         self._drivers, self._coming_steps = view.drivers, COMING_H * per_hour
         self._weight_of_step = _end_of_day_weight(np.arange(24 * per_hour), view.step_h)

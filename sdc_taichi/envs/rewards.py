@@ -332,9 +332,6 @@ def team_of(agents: Sequence[str]) -> tuple[str, ...]:
 
     They are the groups that learn, and the agents of the released code that exist beside them. If
     only agents of the cooling of a hall learn, they are these; of liquid cooling those that learn.
-
-    Args:
-        agents: names of the groups that learn.
     """
     learning, liquid = set(agents), not set(LIQUID_AGENTS).isdisjoint(agents)
     hall = set[str]() if liquid or learning.isdisjoint(HALL_AGENTS) else set(HALL_AGENTS)

@@ -11,9 +11,6 @@ from sdc_taichi.types import F64, I64
 def cleaner_first(view: View) -> I64:
     """Return the other sites of each site's fleet, that with the cleanest grid now first.
 
-    Args:
-        view: the view before a step.
-
     Returns:
         Indices of sites in their fleet, (B, S - 1).
     """

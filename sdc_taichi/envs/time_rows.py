@@ -79,11 +79,7 @@ class TimeRows:
         self._first_rows = self._lengths = np.zeros(0, dtype=np.int64)
 
     def reset(self, view: View) -> None:
-        """Start an episode.
-
-        Args:
-            view: the view before the first step.
-        """
+        """Start an episode."""
         drivers = view.drivers
         has_year = self._steps.stop == _ENDLESS
         new_series = self._forecasts.reset(view)
@@ -208,9 +204,6 @@ class Forecasts:
 
     def reset(self, view: View) -> bool:
         """Start an episode with the inputs and the forecast errors of a view.
-
-        Args:
-            view: the controller's view before the first step.
 
         Returns:
             True if the series differ from those of the previous episode.

@@ -49,11 +49,7 @@ class ViewContext:
         self._sizing: Sizing | None = None
 
     def reset(self, view: View) -> None:
-        """Start an episode.
-
-        Args:
-            view: the view before the first step.
-        """
+        """Start an episode."""
         if view.sizing is self._sizing:
             return
         sizing = self._sizing = view.sizing

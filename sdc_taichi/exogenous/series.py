@@ -271,12 +271,6 @@ def _mean_by_overlap(values: FloatArray, n: int) -> FloatArray:
 def check_physical(name: str, values: ArrayLike, low: float, high: float) -> None:
     """Check that all values are from ``low`` to ``high``.
 
-    Args:
-        name: name of the quantity, for the message.
-        values: values of any shape.
-        low: smallest valid value.
-        high: largest valid value.
-
     Raises:
         DataError: a value is outside; the message names the first index.
     """

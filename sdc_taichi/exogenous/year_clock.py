@@ -64,9 +64,6 @@ def whole_steps(days: float, steps_per_hour: int, what: str = "days") -> int:
 def day_of_year(month_day: object) -> int:
     """Return the day of the year, 0..364, of a text such as ``07-01``.
 
-    Args:
-        month_day: month and day, ``MM-DD``.
-
     Raises:
         ValueError: the text is not a day of a 365-day year.
     """

@@ -68,9 +68,6 @@ class DesignPoint:
 
         With return air control it is the rise from supply to return air at this design point,
         P/(rho cp V_crac); with supply air control it is 0.
-
-        Args:
-            config: The data center.
         """
         if config.hvac.crac.temperature_control == "supply":
             return 0.0
@@ -258,11 +255,6 @@ def odd_airflow(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> tuple[str, ...]:
     """Return warnings about possible but unusual airflows at the design point.
-
-    Args:
-        config: The data center.
-        servers: Servers of the hall, see ``rack_servers``.
-        design: Design point of the hall.
 
     Raises:
         ConfigError: Servers heat their air by more than ``MOST_RISE_K``, or a rack needs more air

@@ -78,12 +78,7 @@ def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
 
 
 def unit_places_m(plan: FloorPlan, units: int) -> F64:
-    """Return x and y of the CRAC units, which alternate between both end walls, in m, (U, 2).
-
-    Args:
-        plan: Floor plan of the hall.
-        units: Number of CRAC units, U.
-    """
+    """Return x and y of the CRAC units, which alternate between both end walls, in m, (U, 2)."""
     index = np.arange(units)
     walls = index % 2
     on_wall = np.array([(units + 1) // 2, units // 2])[walls]

@@ -60,10 +60,6 @@ class RackSelection:
     def check(self, hall: HallConfig, name: str = "") -> None:
         """Check that a hall has the selected racks.
 
-        Args:
-            hall: Hall of a data center.
-            name: Name of the data center, for errors.
-
         Raises:
             ConfigError: The hall does not have a selected rack or row, or not as many racks.
         """

@@ -36,11 +36,7 @@ class LearningSettings(BaseModel):
     take the shared state, which cannot distinguish such agents."""
 
     def steps_per_update(self, episode_steps: int) -> int:
-        """Return the number of steps of each data center between two updates.
-
-        Args:
-            episode_steps: number of steps of an episode.
-        """
+        """Return the number of steps of each data center between two updates."""
         return episode_steps
 
 
@@ -250,12 +246,7 @@ def gradient_steps(name: str, settings: LearningSettings, updates: int) -> int:
 
 
 def uses_state(name: str, settings: LearningSettings) -> bool:
-    """Return True if an algorithm's critics take the shared state of all agents as input.
-
-    Args:
-        name: name of the algorithm.
-        settings: settings of the algorithm.
-    """
+    """Return True if an algorithm's critics take the shared state of all agents as input."""
     if isinstance(settings, OnPolicySettings):
         return (settings.critic or ON_POLICY[name].critic) == "state"
     return isinstance(settings, OffPolicySettings)

@@ -310,9 +310,6 @@ def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
 def check_contenders(contenders: Iterable[Contender]) -> None:
     """Check that name and seed identify each controller, and that the agents exist.
 
-    Args:
-        contenders: the controllers.
-
     Raises:
         ConfigError: two controllers have the same name and seed, a controller is called ``idle`` or
             ``optimum``, or an agent is not in ``MOVES``.
@@ -392,10 +389,6 @@ def evaluate(
 
 class _OneGroup:
     """Controller whose commands take effect for a single group of agents.
-
-    Args:
-        controller: gives the commands.
-        group: name of the group.
 
     Attributes:
         commands: fields of ``Actions`` that the controller gives.
@@ -538,9 +531,6 @@ def _of_fleets(name: str, values: F64, fleet: Fleet) -> F64:
 
 def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
     """Return the settings of the first training; None if the folders hold policies only.
-
-    Args:
-        folders: folders of trainings or policies.
 
     Raises:
         ConfigError: settings are not valid, or the trainings have different data centers.

@@ -132,10 +132,6 @@ def by_agent(evaluation: Evaluation) -> pd.DataFrame:
 def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
     """Compare one controller with each other controller in the same weeks.
 
-    Args:
-        evaluation: the evaluation.
-        controller: name of the controller.
-
     Returns:
         Table with a row for each other controller. ``points`` is the controller's change against
         idle commands minus the other's, in percentage points (negative is better), with the ends of
@@ -182,10 +178,6 @@ def column_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
     """Return a column's values by training and week, (S, W), for each controller.
 
     Only runs in which all agents of the controller acted are included.
-
-    Args:
-        evaluation: the evaluation.
-        column: column of ``evaluation.rows``.
     """
     return {name: _sample(rows, column) for name, rows in _groups(evaluation, ALL)}
 
@@ -365,11 +357,7 @@ def evaluation_content(
 
 
 def remarks(weeks: DataCenterWeeks) -> list[str]:
-    """Return warnings about weeks in which energy and work left at the end have no value.
-
-    Args:
-        weeks: the weeks of the evaluation.
-    """
+    """Return warnings about weeks in which energy and work left at the end have no value."""
     if weeks.optimum is None:
         return ["Without an optimum ends have no value: an empty battery or work put off saves."]
     if not isinstance(weeks.optimum, Optimum):
@@ -383,12 +371,7 @@ def remarks(weeks: DataCenterWeeks) -> list[str]:
 
 
 def tables_of(evaluation: Evaluation, weeks: DataCenterWeeks) -> list[tuple[str, pd.DataFrame]]:
-    """Return titles and tables: all weeks together, by site, by agent, and differences.
-
-    Args:
-        evaluation: the evaluation.
-        weeks: the weeks of the evaluation.
-    """
+    """Return titles and tables: all weeks together, by site, by agent, and differences."""
     names = [n for n in dict.fromkeys(evaluation.rows["controller"]) if is_compared(n)]
     days = weeks.steps // (24 * weeks.sim.fleet.steps_per_hour)
     scored = "day 2" if days == 2 else f"days 2 to {days}"
@@ -431,12 +414,6 @@ def write_evaluation(
     out: Path, evaluation: Evaluation, weeks: DataCenterWeeks, content: Mapping[str, Any]
 ) -> None:
     """Write ``rows.csv``, ``table.md`` and, last, ``evaluation.json``.
-
-    Args:
-        out: the folder.
-        evaluation: the evaluation.
-        weeks: the weeks of the evaluation.
-        content: content of ``evaluation.json``.
 
     Raises:
         SdcError: a file cannot be written.

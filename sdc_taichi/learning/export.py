@@ -27,10 +27,6 @@ _IR_VERSION = 8
 def export_onnx(policy: Policy, path: Path) -> None:
     """Write a policy as an ONNX model; interface, origin and decision steps become metadata.
 
-    Args:
-        policy: the policy.
-        path: file to write.
-
     Raises:
         ConfigError: ONNX is not installed.
         SdcError: the file cannot be written.
@@ -116,11 +112,7 @@ def _between(graph: _Graph, x: str, most: float) -> str:
 
 
 class _Graph:
-    """ONNX graph under construction; each method refers to values by their names.
-
-    Args:
-        onnx: the imported module ``onnx``.
-    """
+    """ONNX graph under construction; each method refers to values by their names."""
 
     def __init__(self, onnx: Any) -> None:
         self._onnx = onnx

@@ -122,11 +122,7 @@ class Interface(Section):
         return sum(numbers.get(name) or 1 for name in self.commands[group_of(agent)])
 
     def options(self, **others: Any) -> EnvOptions:
-        """Return options of environments that have this interface.
-
-        Args:
-            others: further options of the environments, by name.
-        """
+        """Return options of environments that have this interface."""
         options: dict[str, Any] = {
             "agents": self.agents,
             "actions": self.actions,

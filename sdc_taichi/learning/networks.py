@@ -52,9 +52,6 @@ LAST_GAIN = 0.01
 class RunningMoments:
     """Running mean and variance of each column of the added rows (Chan, Golub, LeVeque 1983).
 
-    Args:
-        width: number of columns.
-
     Attributes:
         mean: mean of each column, (width,).
         variance: variance of each column, (width,).

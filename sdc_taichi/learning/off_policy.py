@@ -137,9 +137,6 @@ class OffPolicy:
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
         """Act for ``rollout_decisions`` decisions, and learn from the replay buffer.
 
-        Args:
-            stream: the environments.
-
         Returns:
             Values to log: ``reward/NAME``, the mean reward per step; losses, entropies and
             temperatures, averaged over the gradient steps; ``exploration`` for ``had3qn``.

@@ -149,9 +149,6 @@ class OnPolicy:
 
         The first update only measures mean and variance of the observations.
 
-        Args:
-            stream: the environments.
-
         Returns:
             Values to log: ``reward/NAME``, the mean reward per step; losses; entropies.
         """

@@ -183,11 +183,7 @@ class PolicyNetwork:
 
 
 class NormalisedForward:
-    """Forward pass of a perceptron with layer normalisations, in NumPy.
-
-    Args:
-        network: the network.
-    """
+    """Forward pass of a perceptron with layer normalisations, in NumPy."""
 
     def __init__(self, network: PolicyNetwork) -> None:
         self._network = network

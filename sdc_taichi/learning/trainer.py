@@ -499,9 +499,6 @@ def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> Environ
 def check_numbers(numbers: Mapping[str, float]) -> None:
     """Check the logged values of an update for divergence.
 
-    Args:
-        numbers: logged values of the update by name.
-
     Raises:
         SdcError: a value is not finite, or a loss is above ``LARGEST_LOSS``.
     """

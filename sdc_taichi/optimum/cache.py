@@ -142,11 +142,7 @@ class Cache:
         self._write(self._path(key), _to_arrays(entry, key))
 
     def find_ends(self, key: str) -> dict[Ends, float]:
-        """Return the cached bounds of a key, by the states at start and end of the run.
-
-        Args:
-            key: Key from ``key_of``.
-        """
+        """Return the cached bounds of a key, by the states at start and end of the run."""
 
         def figures(arrays: Mapping[str, Any]) -> dict[Ends, float]:
             if str(arrays["fingerprint"]) != key:
@@ -162,12 +158,7 @@ class Cache:
         return self._read(self._path(f"{key}-ends"), figures, "bounds of ends are") or {}
 
     def keep_ends(self, key: str, figures: Mapping[Ends, float]) -> None:
-        """Write bounds atomically, by the states at start and end of the run.
-
-        Args:
-            key: Key from ``key_of``.
-            figures: Bounds by ``Ends``.
-        """
+        """Write bounds atomically, by the states at start and end of the run."""
         ends = np.array([astuple(each) for each in figures])
         values = {"fingerprint": key, "ends": ends, "figures": np.array([*figures.values()])}
         self._write(self._path(f"{key}-ends"), values)

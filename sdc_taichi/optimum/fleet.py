@@ -254,11 +254,7 @@ class FleetFollower:
         self._step_k = fleet.values("hvac.setpoint.step_k")[fleet.unit_dc]
 
     def actions(self, state: State) -> Actions:
-        """Return the commands of the coming step.
-
-        Args:
-            state: State of the simulator before the step.
-        """
+        """Return the commands of the coming step."""
         flow, demand = self._flows[state.step], self._drivers.at(state.step).demand
         at_site = self._commands.at_site(state, demand, flow)
         executed = state.queue[:, -1] + at_site - self._queue_tasks[state.step]
@@ -512,10 +508,6 @@ def with_room(queue_limit_tasks: float, shared: SharedWork) -> float:
     """Return the longest queue of a plan, which leaves a site room for the work on its way to it.
 
     A site takes no work for which its queue has no room (``sim.transfer``).
-
-    Args:
-        queue_limit_tasks: Longest queue, in tasks.
-        shared: Links of the fleets.
     """
     on_way_tasks = (shared.delay_steps + 1) * TASKS_PER_STEP
     return max(queue_limit_tasks - on_way_tasks, 0.5 * queue_limit_tasks)

@@ -45,9 +45,6 @@ def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
     """Return the paths to plan for a data center, by name, with the agents that each path moves.
 
     The paths are that of idle commands, one for each agent alone, and one for all agents together.
-
-    Args:
-        problem: The planning problem.
     """
     named: dict[str, tuple[Agent, ...]] = {IDLE: ()}
     named |= {agent: (agent,) for agent in problem.agents}

@@ -103,11 +103,7 @@ class Storage:
     """Power drawn from the bus at all times, divided by the capacity, in 1/h."""
 
     def conversion(self, step_h: float) -> Conversion:
-        """Return the conversion between bus and store in a step.
-
-        Args:
-            step_h: Length of a step, in h.
-        """
+        """Return the conversion between bus and store in a step."""
         parameters = BatteryParameters(*(getattr(self, name) for name in BatteryParameters._fields))
         return conversion(self.model, parameters, self.capacity_kwh, step_h)
 
@@ -447,9 +443,6 @@ def no_table_reasons(fleet: Fleet) -> tuple[str | None, ...]:
 
     A table is exact if the energy of a step follows from utilisation, setpoint and weather alone.
 
-    Args:
-        fleet: B data centers.
-
     Returns:
         Reasons for each data center in words, or None if its table is exact, B.
     """
@@ -482,9 +475,6 @@ def uncooled_reason(table: FacilityTable, utilisation: F64) -> str | None:
 
 def forced_discharge_reason(problem: Problem) -> str | None:
     """Return why an idle battery may discharge: the load may exceed the grid connection's limit.
-
-    Args:
-        problem: Planning problem of the data center.
 
     Returns:
         The reason in words, or None if an idle battery never discharges.
@@ -522,10 +512,6 @@ def _reasons(config: DataCenterConfig) -> list[str]:
 
 def loops_reason(problem: Problem, config: DataCenterConfig) -> str | None:
     """Return why the commands of coolant loops in a table may not be the best ones.
-
-    Args:
-        problem: Planning problem of the data center.
-        config: Config of the data center.
 
     Returns:
         The reason in words, or None if they are the best ones or loops are held.

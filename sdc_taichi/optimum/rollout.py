@@ -96,11 +96,7 @@ class RollOut:
     """Largest difference between the supply setpoint of a CDU and its target, in K, (T, B)."""
 
     def of(self, where: Sequence[int]) -> RollOut:
-        """Return the results of some of the data centers.
-
-        Args:
-            where: indices of the data centers.
-        """
+        """Return the results of some of the data centers."""
         return RollOut(*(getattr(self, f.name)[:, list(where)] for f in fields(self)))
 
 
@@ -186,11 +182,7 @@ class Follower:
         self._loops = LoopFollower(fleet, targets.loops)
 
     def actions(self, state: State) -> Actions:
-        """Return the commands of the coming step.
-
-        Args:
-            state: State of the simulator before the step.
-        """
+        """Return the commands of the coming step."""
         return Actions(
             load=self._load(state),
             cooling=self._cooling(state),
@@ -199,11 +191,7 @@ class Follower:
         )
 
     def loops_lag_k(self, state: State) -> F64:
-        """Return the largest difference between setpoint and target of a CDU, in K, (B,).
-
-        Args:
-            state: State after a step.
-        """
+        """Return the largest difference between setpoint and target of a CDU, in K, (B,)."""
         lag_k = np.zeros(self._fleet.size)
         target_c = self._targets.loops[state.step - 1, self._fleet.cdu_dc, 0]
         apart_k = np.abs(state.cdu_setpoint_c - target_c)
@@ -263,11 +251,7 @@ class LoopFollower:
         )
 
     def commands(self, state: State) -> dict[str, F64]:
-        """Return the commands of the coming step by field of ``Actions``; empty if all hold.
-
-        Args:
-            state: State before the step.
-        """
+        """Return the commands of the coming step by field of ``Actions``; empty if all hold."""
         if not self._moves:
             return {}
         setpoint_c, flow, wanted_k = self._wanted[state.step].T
@@ -464,20 +448,11 @@ class Certificate:
     """Heat that the cooling does not remove from the room, in kWh."""
 
     def failures(self, idle: Certificate, capacity_kwh: float) -> tuple[str, ...]:
-        """Return the constraints that the plan breaks, in words; empty for a valid plan.
-
-        Args:
-            idle: Certificate of idle commands.
-            capacity_kwh: Capacity of the battery, in kWh.
-        """
+        """Return the constraints that the plan breaks, in words; empty for a valid plan."""
         return (*self.worse_ends(capacity_kwh), *self.broken(idle))
 
     def worse_ends(self, capacity_kwh: float) -> tuple[str, ...]:
-        """Return in words how the end state is worse than that of the first scored step.
-
-        Args:
-            capacity_kwh: Capacity of the battery, in kWh.
-        """
+        """Return in words how the end state is worse than that of the first scored step."""
         missing_kwh = self.missing_kwh(capacity_kwh)
         more_tasks = self.end_tasks - self.start_tasks
         texts = []
@@ -488,20 +463,12 @@ class Certificate:
         return tuple(texts)
 
     def missing_kwh(self, capacity_kwh: float) -> float:
-        """Return the stored energy that the end lacks, in kWh; 0 within rounding errors.
-
-        Args:
-            capacity_kwh: Capacity of the battery, in kWh.
-        """
+        """Return the stored energy that the end lacks, in kWh; 0 within rounding errors."""
         missing_kwh = self.start_kwh - self.end_kwh
         return missing_kwh if missing_kwh > _LEAST_STORED_SHARE * capacity_kwh else 0.0
 
     def broken(self, idle: Certificate) -> tuple[str, ...]:
-        """Return the constraints on work and temperatures that the plan breaks, in words.
-
-        Args:
-            idle: Certificate of idle commands.
-        """
+        """Return the constraints on work and temperatures that the plan breaks, in words."""
         hot = ""
         if self.over_limit_k > LEAST_K:
             over_k = self.hottest_inlet_c - self.inlet_limit_c

@@ -113,12 +113,7 @@ def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64
 
 
 def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
-    """Compute the largest convex curves below cost and minimum energy by executed work.
-
-    Args:
-        problem: The planning problem.
-        stage: Minimum cost and energy of each step.
-    """
+    """Compute the largest convex curves below cost and minimum energy by executed work."""
     least, most = work_limits(problem)
     return curves_between(stage, least, most, weighs_water=problem.litre_weight > 0)
 
@@ -165,12 +160,7 @@ def curves_between(
 
 
 def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
-    """Return curves that consist of a single point, the work executed under idle commands.
-
-    Args:
-        problem: The planning problem.
-        stage: Minimum cost and energy of each step.
-    """
+    """Return curves that consist of a single point, the work executed under idle commands."""
     tasks, none = problem.work.idle_tasks, np.zeros(0)
     return LoadCurves(
         least_tasks=tasks,

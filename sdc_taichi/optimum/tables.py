@@ -256,13 +256,7 @@ def batches(fleet: Fleet, nodes: Sequence[Nodes]) -> Iterator[list[Nodes]]:
 
 
 def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
-    """Return all values, except weather, load and setpoint, on which a facility's energy depends.
-
-    Args:
-        fleet: B data centers.
-        drivers: Inputs of the data centers.
-        dc: Index of the data center.
-    """
+    """Return all values but weather, load and setpoint on which a facility's energy depends."""
     config = fleet.configs[dc]
     setpoint = config.hvac.setpoint
     first_c = setpoint.model_copy(update={"initial_c": setpoint.min_c, "schedule_c": None})

@@ -67,11 +67,7 @@ class Task:
     kinds have the same key."""
 
     def part(self, where: Sequence[int]) -> Task:
-        """Return the task of some of the data centers.
-
-        Args:
-            where: indices of the data centers.
-        """
+        """Return the task of some of the data centers."""
         chosen = list(where)
         return replace(
             self,
@@ -187,12 +183,7 @@ class Task:
 
 
 def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
-    """Set the seeds of data centers without sampled events to 0, (B,).
-
-    Args:
-        seed: seed of each data center, (B,).
-        fleet: the B data centers.
-    """
+    """Set the seeds of data centers without sampled events to 0, (B,)."""
     return np.where([bool(config.events.sampled) for config in fleet.configs], seed, 0)
 
 

@@ -224,9 +224,6 @@ def coil_capacity_w(design: WaterSideDesign) -> F64:
     difference of the means, of which half is in the film of the water and grows with its flow to
     the power -3/4 (see ``coil_range_ratio``). Air side and inlet temperatures are those of the
     design point, at which full flow gives ``cooling_w``.
-
-    Args:
-        design: Sized devices.
     """
     flow = design.pumped_w / design.cooling_w
     water_k, air_k = 0.5 * design.chilled_water_range_k, 0.5 * design.coil_rise_k

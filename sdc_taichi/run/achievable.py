@@ -100,10 +100,6 @@ def fleet_achievement(optimum: FleetOptimum, score: FleetScore) -> Achievement:
     """Compare the score of a run of F fleets with their known optimum.
 
     Arrays have the shape (F,). The figure already values the work that is left at the end.
-
-    Args:
-        optimum: Known optimum of the same fleets and steps.
-        score: Score of the run.
     """
     figure, saving = score.figure, float((optimum.idle - optimum.achieved).sum())
     broken = [

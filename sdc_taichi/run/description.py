@@ -41,12 +41,7 @@ class RunRequest:
 
 
 def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
-    """Return the part of metrics.json that is known before the first step.
-
-    Args:
-        sim: The simulator.
-        request: Requested controller, steps and seed.
-    """
+    """Return the part of metrics.json that is known before the first step."""
     drivers = sim.drivers
     hashes = _file_hashes(sim.fleet.configs)
     return {

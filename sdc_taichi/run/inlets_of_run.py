@@ -42,10 +42,6 @@ class InletsAtStep:
 def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
     """Read the inlets of a data center in its hottest step from the air in steps.parquet.
 
-    Args:
-        run: The run.
-        dc: Index of the data center.
-
     Returns:
         The inlets; None if the run was too large to store its air.
 

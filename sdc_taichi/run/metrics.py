@@ -134,12 +134,7 @@ def finite_or_none(value: float) -> float | None:
 
 
 def empty_totals(size: int, step_h: float) -> Totals:
-    """Return the totals before the first step of a run.
-
-    Args:
-        size: Number of data centers, B.
-        step_h: Length of a step, in h.
-    """
+    """Return the totals before the first step of a run."""
     return Totals(
         steps=0,
         step_h=step_h,

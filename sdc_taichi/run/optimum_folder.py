@@ -37,12 +37,7 @@ margin covers round-off."""
 
 
 def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> dict[str, Any]:
-    """Return the content of optimum.json.
-
-    Args:
-        optimum: The optimum.
-        reached: Comparisons of controllers with the optimum.
-    """
+    """Return the content of optimum.json."""
     dcs = range(len(optimum.names))
     total = _figures(
         {name: float(getattr(optimum, name).sum()) for name in _FIGURES},
@@ -141,11 +136,7 @@ def find_optimum(folder: Path, fingerprint: str, steps: int) -> tuple[Path, dict
 
 
 def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
-    """Return sentences that explain the values of an optimum, and its failed checks.
-
-    Args:
-        content: Content of optimum.json.
-    """
+    """Return sentences that explain the values of an optimum, and its failed checks."""
     dcs = content["data_centers"]
     remarks = ["Achieved: what the simulator reached with all inputs known in advance."]
     if any(dc["bound_kind"] == _BOUND for dc in dcs):

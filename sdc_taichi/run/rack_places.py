@@ -306,12 +306,7 @@ class _Limits:
 
 
 def _limits(fleet: Fleet, solver: Hall) -> _Limits:
-    """Return what plant, coils, UPS and grid connection of a hall can do, as it is sized.
-
-    Args:
-        fleet: The hall.
-        solver: Its solver.
-    """
+    """Return what plant, coils, UPS and grid connection of a hall can do, as it is sized."""
     inputs = load_drivers(fleet.configs)
     sizing = size(fleet, solver, inputs.design_outdoor_c, inputs.design_wet_bulb_c)
     plant_kw = float(sizing.water_side.coils_w[0]) / 1e3

@@ -230,11 +230,7 @@ class AirAtStep:
 
 
 class HottestAir:
-    """Records the air of each data center in its hottest step, the first one if several are equal.
-
-    Args:
-        sim: The simulator.
-    """
+    """Records the air of each data center in its hottest step, the first of several equal ones."""
 
     def __init__(self, sim: Simulator) -> None:
         self._sim = sim
@@ -276,12 +272,6 @@ def air_values(hottest: AirAtStep) -> dict[str, Any]:
 
 def air_from_values(values: dict[str, Any], *, racks: int, units: int, steps: int) -> AirAtStep:
     """Convert plain values of ``air_values`` back to air.
-
-    Args:
-        values: The plain values.
-        racks: Number of racks of the hall.
-        units: Number of CRAC units of the hall.
-        steps: Number of steps of the run.
 
     Raises:
         ValueError: A value is missing or out of range, or a list has a wrong length.

@@ -18,10 +18,6 @@ def with_prices(drivers: Drivers, configs: Sequence[DataCenterConfig]) -> Driver
     """Add the electricity prices of the tariffs to the inputs of a fleet.
 
     Inputs that already have prices are returned unchanged.
-
-    Args:
-        drivers: Inputs of B data centers.
-        configs: Configs of the B data centers.
     """
     if drivers.price_per_kwh is not None:
         return drivers
@@ -130,12 +126,7 @@ def add_power(demand: BilledDemand, step: int, power_kw: F64) -> None:
 
 
 def billed_kw_months(demand: BilledDemand, steps: int) -> F64:
-    """Return the sum over all months of peak power times covered share, in kW, (B,).
-
-    Args:
-        demand: Billed demand of the run.
-        steps: Number of steps of the run.
-    """
+    """Return the sum over all months of peak power times covered share, in kW, (B,)."""
     covered = steps - np.maximum(demand.month_begin, 0)
     share = covered / (demand.month_end - demand.month_begin)
     return np.asarray(demand.billed_kw_months + demand.month_peak_kw * share)

@@ -229,9 +229,6 @@ class InputReader:
     """Reads the inputs of a fleet as configured, or for other years and workload traces.
 
     Inputs are cached up to ``MAX_KEPT_BYTES``; the least recently used ones are evicted first.
-
-    Args:
-        configs: Configs of B data centers.
     """
 
     def __init__(self, configs: Sequence[DataCenterConfig]) -> None:

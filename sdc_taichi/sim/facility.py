@@ -223,9 +223,6 @@ class Facility:
     def step(self, inputs: StepInputs) -> dict[str, F64]:
         """Compute CRAC, plant, water, energy and index quantities of a step.
 
-        Args:
-            inputs: Results of the preceding stages.
-
         Returns:
             Quantities of ``StepResult`` by their field names, each (B,).
         """
@@ -569,12 +566,7 @@ class Facility:
 
 
 class FacilityStage:
-    """Runs the models of a facility as compiled kernels over the data centers.
-
-    Args:
-        fleet: B data centers.
-        facility: Models and sized devices of the data centers.
-    """
+    """Runs the models of a facility as compiled kernels over the data centers."""
 
     def __init__(self, fleet: Fleet, facility: Facility) -> None:
         from sdc_taichi.kernels.compiler.stage import CompiledStage

@@ -244,11 +244,7 @@ class Hall:
         self._has_rows_along_racks = False
 
     def set_heat(self, rack_w: F64) -> None:
-        """Set the heat of the racks of ``take_heat_of`` while they are on, without fans.
-
-        Args:
-            rack_w: Heat of each of these racks, in W.
-        """
+        """Set the heat of the racks of ``take_heat_of`` while they are on, without fans."""
         self._rack["heat_w"][self._heat_places] = self._heat_share * rack_w
         of_dc_w = np.bincount(self._heat_dc, rack_w, self._fleet.size)
         self._dc["liquid_heat"][:] = of_dc_w / self._full_heat_w

@@ -230,13 +230,7 @@ class InletParts:
 
 
 class Inlets:
-    """Explains the inlet temperatures of one data center from the air before its R racks.
-
-    Args:
-        fleet: The data centers.
-        dc: Index of the data center.
-        air: Air before the racks of this data center.
-    """
+    """Explains the inlet temperatures of one data center from the air before its R racks."""
 
     def __init__(self, fleet: Fleet, dc: int, air: IntakeAir) -> None:
         self._fleet, self._dc, self._air = fleet, dc, air

@@ -275,10 +275,6 @@ class Liquid:
     ) -> tuple[LiquidState, LiquidResult]:
         """Compute one step of B data centers.
 
-        Args:
-            state: State before the step.
-            inputs: Loads, weather, commands and failures.
-
         Returns:
             State after the step, and results.
         """

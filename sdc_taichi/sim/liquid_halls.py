@@ -163,15 +163,7 @@ class LiquidHalls:
         placement: Placement,
         supply: Supply,
     ) -> LiquidStep:
-        """Compute a step, and tell the halls the heat in their air.
-
-        Args:
-            state: State at the start of the step.
-            commands: Commands of the step.
-            surroundings: Weather and failures of the step.
-            placement: Placement of the work.
-            supply: Operation of the CRAC units.
-        """
+        """Compute a step, and tell the halls the heat in their air."""
         on = self._all_on
         if placement.rack_powered is not None:
             on = placement.rack_powered[self._racks]
@@ -376,11 +368,7 @@ def with_leaks(state: State, surroundings: Surroundings, fleet: Fleet) -> State:
 
 
 def without_liquid(fleet: Fleet) -> dict[str, Any]:
-    """Return ``LiquidQuantities`` of a step without liquid cooling by name, as arrays of their own.
-
-    Args:
-        fleet: The data centers.
-    """
+    """Return ``LiquidQuantities`` of a step without liquid cooling by name, as new arrays."""
     rows = np.zeros((len(_NAMES[DATA_CENTERS]), fleet.size))
     # These times are -1 in steps in which nothing happens.
     rows[_TIMES] = -1.0

@@ -75,9 +75,6 @@ class SharedWork:
 def shared_work(configs: Sequence[DataCenterConfig]) -> SharedWork | None:
     """Return links and budgets of fleets; None if the data centers are no whole fleets.
 
-    Args:
-        configs: Configs of B data centers.
-
     Raises:
         ConfigError: Sites of a fleet or fleets do not fit together.
     """

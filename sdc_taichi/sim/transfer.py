@@ -104,10 +104,6 @@ class Transfer:
     of the work that arrives in the step for which it has capacity beside its own work. Since own
     work does not exceed capacity, nothing is then dropped on arrival, unless a site loses capacity
     or fills its queue on command. In a batch of data centers that run alone nothing moves.
-
-    Args:
-        fleet: B data centers.
-        sizing: Their sized devices.
     """
 
     def __init__(self, fleet: Fleet, sizing: Sizing) -> None:

@@ -207,11 +207,7 @@ def queue_length(fleet: Fleet) -> int:
 
 
 class Workload:
-    """Runs the workload model of a fleet and updates its queues.
-
-    Args:
-        fleet: B data centers.
-    """
+    """Runs the workload model of a fleet and updates its queues."""
 
     def __init__(self, fleet: Fleet) -> None:
         from sdc_taichi.kernels.compiler.stage import CompiledStage

@@ -40,10 +40,6 @@ _ARCHIVE = b"PK\x03\x04"
 def request_year(latitude_deg: float, longitude_deg: float) -> Request:
     """Build the request for the typical year of a location.
 
-    Args:
-        latitude_deg: latitude, in degrees north.
-        longitude_deg: longitude, in degrees east.
-
     Raises:
         DataError: the coordinates are out of range.
     """
