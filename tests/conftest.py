@@ -53,6 +53,14 @@ def user_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a made-up study of a suite."""
+    from made_studies import write_study
+
+    return write_study(tmp_path_factory.mktemp("study") / "made-up")
+
+
 @pytest.fixture
 def one_torch_thread() -> Iterator[None]:
     """Lets PyTorch use one thread, as learners of this package do: sums have the same bits then."""

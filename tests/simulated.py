@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,13 @@ from sdc_taichi import (
     Simulator,
     StepResult,
     drivers_from_arrays,
+    load_config,
+    make_configs,
 )
 from sdc_taichi.types import QUANTITIES
+
+if TYPE_CHECKING:
+    from sdc_taichi import Recorder
 
 
 def short_drivers(size: int = 1, steps: int = 96, seed: int = 0) -> Drivers:
@@ -46,6 +51,17 @@ def random_actions(
         )
         for _ in range(steps)
     ]
+
+
+def small(count: int = 1) -> Simulator:
+    """Simulator of data centers of preset ``tiny``."""
+    return Simulator(make_configs(load_config("tiny"), count=count))
+
+
+def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
+    """Step, and record."""
+    for _ in range(steps):
+        rec.add(sim.step())
 
 
 def run(sim: Simulator, actions: Sequence[Actions]) -> list[StepResult]:

@@ -15,11 +15,6 @@ from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.cli.app import app
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_study(tmp_path_factory.mktemp("study") / "made-up")
-
-
 def page_of(folder: Path, out: Path) -> tuple[Page, tuple[str, ...]]:
     notes = write_report([folder], html=out)
     return read_page(out.read_text("utf-8")), notes

@@ -13,14 +13,13 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from known_optimum import made_up_optimum
+from known_optimum import made_up_solve
 from policies import interface, network
-from sdc_taichi import ConfigError, Fleet, Simulator
+from sdc_taichi import ConfigError
 from sdc_taichi.cli import evaluate as commands
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning import evaluation
 from sdc_taichi.learning.policy import About, Policy
-from sdc_taichi.optimum.result import Optimum
 
 CASE = ("--config", "tiny", "--site", "ny,ca", "--weeks", "27", "--days", "2")
 
@@ -31,13 +30,7 @@ def call(*arguments: object) -> Result:
 
 @pytest.fixture(autouse=True)
 def _solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    def solve(
-        fleet: Fleet, *, steps: int, drivers: Any, objective: Any, scored_from: int, **_: Any
-    ) -> Optimum:
-        with Simulator(fleet, drivers=drivers) as sim:
-            return made_up_optimum(sim, steps, str(objective), scored_from)
-
-    monkeypatch.setattr(evaluation, "solve", solve)
+    monkeypatch.setattr(evaluation, "solve", made_up_solve)
 
 
 @pytest.fixture(scope="module")

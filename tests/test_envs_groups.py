@@ -17,27 +17,13 @@ from sdc_taichi.envs.site_order import cleaner_first
 from sdc_taichi.envs.view_terms import OF_DATA_CENTERS, UTILISATIONS
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.sim.transfer import task_kwh
+from small_halls import DOWN, hall
 
 # Observations have several types, of which these environments return one.
 HALL_ENV: Any = sdc_taichi.hall_env
 PARALLEL_ENV: Any = sdc_taichi.parallel_env
 VECTOR_ENV: Any = sdc_taichi.vector_env
-SMALL = [
-    *("hall.rows=2", "hall.racks_per_row=6", "hall.rack_plan=[{type: compute}]"),
-    *("hvac.crac.spare_units=0", "hvac.crac.unit_sizes=equal"),
-]
-
-
-def hall(units: int, *more: str) -> Any:
-    return load_config("hall_agents_6", [*SMALL, f"hvac.crac.units={units}", *more])
-
-
 HALL = hall(3)
-DOWN = hall(
-    3,
-    "events.sampled=[]",
-    "events.scheduled=[{kind: crac_down, start_h: 0, duration_h: 1, unit: 1}]",
-)
 FLEET = load_config("fleet_of_eight", ["fleet.sites=[AZ, CA, WA]"])
 TWICE: dict[str, Any] = {"agents": ["crac", "agent_dc"], "commands": {"agent_dc": ["fan"]}}
 WRONG = {"crac": {"zone_carbon": 1.0}}
@@ -101,7 +87,7 @@ def test_an_agent_sees_its_own_unit_and_its_neighbours() -> None:
 
 
 def test_a_unit_that_is_down_does_not_act() -> None:
-    env = HALL_ENV(DOWN)
+    env = HALL_ENV(hall(3, *DOWN))
     _, infos = env.reset(seed=0)
     assert [infos[f"crac_{unit}"]["acts"] for unit in range(3)] == [1, 1, 1]
     *_, infos = env.step(zeros(env))

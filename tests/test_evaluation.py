@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from known_optimum import KWH_VALUE, made_up_optimum
-from sdc_taichi import ConfigError, Fleet, Simulator, load_config, make_configs, make_controller
+from known_optimum import KWH_VALUE, made_up_solve
+from sdc_taichi import ConfigError, load_config, make_configs, make_controller
 from sdc_taichi.control import Controller
 from sdc_taichi.learning import evaluation
 from sdc_taichi.learning.evaluation import (
@@ -29,17 +29,10 @@ RULES = "load=greedy-ci,cooling=g36,battery=greedy-ci"
 CONFIGS = make_configs(load_config("tiny"), sites=["ny", "ca"])
 
 
-def solve(
-    fleet: Fleet, *, steps: int, drivers: Any, objective: Any, scored_from: int, **_: Any
-) -> Optimum:
-    with Simulator(fleet, drivers=drivers) as sim:
-        return made_up_optimum(sim, steps, str(objective), scored_from)
-
-
 @pytest.fixture(scope="module")
 def weeks() -> Iterator[DataCenterWeeks]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "solve", solve)
+        patch.setattr(evaluation, "solve", made_up_solve)
         with prepare(CONFIGS, (27, 31), days=2) as made:
             yield made
 

@@ -20,11 +20,6 @@ from sdc_taichi.benchmark.suite_results import read_suites
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_study(tmp_path_factory.mktemp("study") / "made-up")
-
-
-@pytest.fixture(scope="module")
 def board(study: Path) -> Leaderboard:
     (suite,) = read_suites([study])
     return leaderboard(suite.cases["two-sites"])

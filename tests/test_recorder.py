@@ -50,6 +50,7 @@ from sdc_taichi.viz import (
 )
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_text import failure_entries, protection_entries
+from simulated import go_on, small
 
 STEPS = 130  # of blocks of 96 in this test: more than one, and no multiple
 ODD_NAME = "hall/1 [a]"
@@ -635,15 +636,6 @@ def test_large_3d_halls_show_the_hottest_of_adjacent_racks(monkeypatch: pytest.M
     grid = hall_rasters.rack_voxels(sim.fleet.configs[0].hall, 1)
     assert len({tuple(index) for index in grid.front}) == len(inlets) == 350
     assert grid.size_m[0] == pytest.approx(3 * 0.6)
-
-
-def small(count: int = 1) -> Simulator:
-    return Simulator(make_configs(load_config("tiny"), count=count))
-
-
-def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
-    for _ in range(steps):
-        rec.add(sim.step())
 
 
 def test_episodes_get_files_of_their_own(tmp_path: Path) -> None:

@@ -20,20 +20,17 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from rrd import VIEWER_ENVIRONMENT, read, verify
-from sdc_taichi import SdcError, Simulator, load_config, make_configs
+from sdc_taichi import SdcError
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.view import viewer_program
 from sdc_taichi.viz import recording_output
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_blocks import MAX_BLOCK_STEPS
 from sdc_taichi.viz.recording_output import RecordingWarning, listens, served_at
+from simulated import go_on, small
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals and limits of POSIX")
-
-
-def small(count: int = 1) -> Simulator:
-    return Simulator(make_configs(load_config("tiny"), count=count))
 
 
 def recorded_steps(path: Path) -> list[int]:
@@ -53,11 +50,6 @@ def wait_for(ready: Callable[[], bool], what: str) -> None:
     while not ready():
         assert time.monotonic() < limit, what
         time.sleep(0.02)
-
-
-def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
-    for _ in range(steps):
-        rec.add(sim.step())
 
 
 def free_port() -> int:

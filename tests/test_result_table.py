@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from made_studies import ROWS, done_job, frame_of, frames_of_row, write_study
+from made_studies import ROWS, done_job, frame_of, frames_of_row
 from sdc_taichi import ConfigError, SdcError, load_config
 from sdc_taichi.benchmark.executors import Executor, run_jobs
 from sdc_taichi.benchmark.jobs import DoneJob, Job, digest_of, run_job
@@ -109,11 +109,6 @@ FORGERIES = [
     ("other", "moves", column("chiller")),
 ]
 COUNTS = ("fewer rows", "more rows", "no rows")
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_study(tmp_path_factory.mktemp("study") / "made-up")
 
 
 def forged(frame: pd.DataFrame, name: str, forge: Forge) -> bytes:

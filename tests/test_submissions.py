@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from made_studies import IDLE, frame_of, write_study
+from made_studies import IDLE, frame_of
 from policies import interface, policy
 from sdc_taichi import ConfigError, SdcError
 from sdc_taichi.benchmark.cases import data_centers
@@ -29,11 +29,6 @@ from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
 
 PARTITION = {"suite": "made-up", "case": "two-sites", "row": "theirs", "seed": "0"}
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_study(tmp_path_factory.mktemp("study") / "made-up")
 
 
 @pytest.fixture
