@@ -717,12 +717,10 @@ def _highest_of_running(view: View, per_unit: F64) -> F64:
 
 
 def features_by_agent(
-    chosen: Mapping[str, Sequence[str]] | None,
+    chosen: Mapping[str, Sequence[str]],
     known: Sequence[Feature],
-    commands: Mapping[str, Sequence[str]] | None = None,
-    *,
-    agents: Sequence[str] = AGENTS,
-    of_units: Mapping[str, Sequence[Feature]] | None = None,
+    of_units: Mapping[str, Sequence[Feature]],
+    commands: Mapping[str, Sequence[str]],
 ) -> dict[str, tuple[Feature, ...]]:
     """Return the features that each agent observes.
 
@@ -730,30 +728,28 @@ def features_by_agent(
     speeds or rack inlets if it decides the command ``fan`` or ``placement``.
 
     Args:
-        chosen: names of features by agent; None gives all agents their default features.
+        chosen: names of features by agent.
         known: all features of data centers.
-        commands: commands that agents decide, by agent; None means the default commands.
-        agents: names of the agents that observe.
         of_units: all features of units by kind, which agents of these units can observe too.
+        commands: commands that each observing agent decides.
 
     Raises:
         ConfigError: an agent or feature is unknown, a feature is named twice, or an agent has no
             features.
     """
-    chosen = chosen or {}
     for agent in chosen:
         if agent not in AGENT_DEFINITIONS:
             raise ConfigError(
                 f"features: unknown agent {agent!r}{suggestion_or_valid(agent, AGENT_DEFINITIONS)}"
             )
     out: dict[str, tuple[Feature, ...]] = {}
-    for agent in agents:
-        of_agent = (*known, *(of_units or {}).get(AGENT_DEFINITIONS[agent].axis, ()))
+    for agent, decided in commands.items():
+        of_agent = (*known, *of_units.get(AGENT_DEFINITIONS[agent].axis, ()))
         by_name = {feature.name: feature for feature in of_agent}
-        acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
+        acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in decided]
         default = [n for n in (*AGENT_DEFINITIONS[agent].features, *acted_on) if n in by_name]
         names = chosen.get(agent, default)
-        if isinstance(names, str) or not names:
+        if not names:
             raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")
         for name in names:
             if name not in by_name:

@@ -15,12 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.control.view import View, mean_setpoint_c
-from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, HALL_AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, HALL_AGENTS
 from sdc_taichi.envs.features import (
     AGE_EDGES_H,
-    CI_LEADS_H,
     UNLIMITED_QUEUE_H,
-    WEATHER_LEADS_H,
     Design,
     Feature,
     Layout,
@@ -53,13 +51,8 @@ class Observer:
 
     Args:
         fleet: the B data centers.
-        agents: names of the agents that observe.
-        features: names of the features of each agent; None means the default features.
-        ci_leads_h: leads of the carbon-intensity forecast, in h; increasing multiples of the step.
-        weather_leads_h: leads of the weather forecasts, in h; increasing multiples of the step.
+        options: environment options, among them agents, features and leads.
         new_inputs: True if inputs may differ from episode to episode.
-        commands: commands that agents decide, by agent; None means the default commands.
-        neighbours: number of neighbouring CRAC units that an agent of a unit observes.
         slots: places of units in the observations of their agents, by group; None means as few as
             fit.
 
@@ -70,40 +63,34 @@ class Observer:
         state_space: space of the shared state.
 
     Raises:
-        ConfigError: an agent or feature is unknown, or a lead is not valid.
+        ConfigError: an agent or feature is unknown, or leads do not fit the step.
     """
 
     def __init__(
         self,
         fleet: Fleet,
+        options: EnvOptions,
         *,
-        agents: Sequence[str] = AGENTS,
-        features: Mapping[str, Sequence[str]] | None = None,
-        ci_leads_h: Sequence[float] = CI_LEADS_H,
-        weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
         new_inputs: bool = False,
-        commands: Mapping[str, Sequence[str]] | None = None,
-        neighbours: int = 0,
         slots: Mapping[str, UnitSlots] | None = None,
     ) -> None:
-        forecasts = Forecasts(
-            fleet.steps_per_hour, ci_leads_h=ci_leads_h, weather_leads_h=weather_leads_h
-        )
+        agents, leads = options.agents, (options.ci_leads_h, options.weather_leads_h)
+        commands = {agent: options.commands_of(agent) for agent in agents}
+        forecasts = Forecasts(fleet.steps_per_hour, *leads)
         units = np.diff(fleet.unit_offsets)
         self._equal_units = bool(np.all(units == units[0]))
         of_dcs = [agent for agent in agents if not AGENT_DEFINITIONS[agent].per_unit]
         of_units = [agent for agent in agents if AGENT_DEFINITIONS[agent].per_unit]
-        decided = {name for agent in of_dcs for name in (commands or {}).get(agent, ())}
+        decided = {name for agent in of_dcs for name in commands[agent]}
         count = int(units[0]) if self._equal_units else 1
         self._layout = layout = Layout(
-            ci_leads_h,
-            weather_leads_h,
+            *leads,
             units=count,
             fans=count if "fan" in decided else 0,
             racks=int(fleet.rack_offsets[1]) if "placement" in decided else 0,
             hall=int(not set(agents).isdisjoint(HALL_AGENTS)),
             liquid=int(all(config.liquid is not None for config in fleet.configs)),
-            neighbours=neighbours,
+            neighbours=options.neighbours,
             other_sites=fleet.sites_per_fleet - 1 if "agent_geo" in agents else 0,
         )
         of_time, self._measured = time_features(layout), measured_features(layout)
@@ -118,7 +105,7 @@ class Observer:
         ]
         self.state_space = features_space((*self.state_features, *by_slot))
         self.features = features_by_agent(
-            features, self.state_features, commands, agents=agents, of_units=self._of_units
+            options.features or {}, self.state_features, self._of_units, commands
         )
         self.spaces = {agent: features_space(x) for agent, x in self.features.items()}
         observed = {f for of_agent in self.features.values() for f in of_agent}
@@ -318,30 +305,14 @@ def make_observer(
     new_inputs: bool = False,
     slots: Mapping[str, UnitSlots] | None = None,
 ) -> Observer | ReleasedObserver:
-    """Create the observer of the agents that learn.
-
-    Args:
-        fleet: the data centers.
-        options: environment options, among them features and leads.
-        new_inputs: True if inputs may differ from episode to episode.
-        slots: places of units in observations, by group; None means as few as fit.
+    """Create the observer of the agents that learn, with the arguments of ``Observer``.
 
     Raises:
         ConfigError: features or leads do not fit the data centers.
     """
     if options.observations == "sustaindc":
         return ReleasedObserver(options.agents)
-    return Observer(
-        fleet,
-        agents=options.agents,
-        features=options.features,
-        ci_leads_h=options.ci_leads_h,
-        weather_leads_h=options.weather_leads_h,
-        new_inputs=new_inputs,
-        commands={agent: options.commands_of(agent) for agent in options.agents},
-        neighbours=options.neighbours,
-        slots=slots,
-    )
+    return Observer(fleet, options, new_inputs=new_inputs, slots=slots)
 
 
 def _entries_of_units(
