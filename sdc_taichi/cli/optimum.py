@@ -39,7 +39,6 @@ from sdc_taichi.exogenous.year_clock import whole_steps
 
 if TYPE_CHECKING:
     from sdc_taichi.control import Controller, ForecastError
-    from sdc_taichi.optimum.objective import Objective
     from sdc_taichi.optimum.problem import Agent
     from sdc_taichi.optimum.result import Optimum
     from sdc_taichi.run.achievable import Achievement
@@ -156,8 +155,8 @@ def optimum_command(
         print_notes(sim.drivers.notes)
         optimum = solve_beside(
             sim,
-            aim,
-            steps,
+            objective=aim,
+            steps=steps,
             seed=run.seed,
             agents=movable,
             scored_from=scored_from,
@@ -194,34 +193,15 @@ def optimum_command(
 
 
 def solve_beside(
-    sim: Simulator,
-    objective: Objective,
-    steps: int,
-    *,
-    seed: int,
-    agents: tuple[Agent, ...] | None = None,
-    scored_from: int = 0,
-    inlet_limit_c: float | None = None,
-    uncoordinated: bool = False,
-    cache: bool = True,
-    quiet: bool,
-    stop: Callable[[], bool],
+    sim: Simulator, *, quiet: bool, stop: Callable[[], bool], **options: Any
 ) -> Optimum:
     """Solve for the optimum of a simulator's data centers and inputs, with progress bars.
 
     Args:
         sim: the simulator.
-        objective: what to minimise.
-        steps: number of steps.
-        seed: seed of the sampled events.
-        agents: agents whose commands are optimised; None is all.
-        scored_from: first step that counts in the objective.
-        inlet_limit_c: hottest allowed inlet, in C; None is the limit of
-            ``protection.ashrae_class``.
-        uncoordinated: True to compute also the figures of agents that do not plan together.
-        cache: True to read stored results and to store new ones.
         quiet: True to show no progress.
         stop: function that is called regularly; the work ends when it returns True.
+        options: further arguments of ``optimum.solve``.
 
     Raises:
         typer.Exit: the user stopped the solver; a message on stderr lists the stored results.
@@ -232,18 +212,11 @@ def solve_beside(
     with exit_if_stopped(), stage_bars(shown=not quiet) as progress:
         return solve(
             sim.fleet,
-            steps=steps,
-            seed=seed,
             drivers=sim.drivers,
-            objective=objective,
-            agents=agents,
-            scored_from=scored_from,
-            inlet_limit_c=inlet_limit_c,
             precision=sim.precision,
-            uncoordinated=uncoordinated,
-            cache=cache,
             progress=progress,
             stop=stop,
+            **options,
         )
 
 

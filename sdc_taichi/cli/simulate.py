@@ -235,7 +235,12 @@ def simulate_command(
                 None
                 if objective is None
                 else solve_beside(
-                    sim, objective, steps, seed=run.seed, quiet=quiet, stop=interrupted
+                    sim,
+                    objective=objective,
+                    steps=steps,
+                    seed=run.seed,
+                    quiet=quiet,
+                    stop=interrupted,
                 )
             )
             with progress_bar(steps, shown=not quiet) as advance:
