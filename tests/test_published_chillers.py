@@ -26,8 +26,6 @@ from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.types import F64, WaterSideResult, fields_of
 
-TRANE_CAPACITY = (4.007341e-01, 1.148568e-03, 1.049504e-04, 5.574667e-02, -1.646131e-03,
-                  1.323200e-03)  # fmt: skip
 TRANE_EIR = (6.287646e-01, -3.024605e-02, 6.137016e-04, 1.805826e-02, 1.640653e-04,
              -1.113802e-04)  # fmt: skip
 TRANE_COP, TRANE_LEAST_LOAD = 6.61, 0.1

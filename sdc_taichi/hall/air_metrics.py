@@ -113,10 +113,7 @@ def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values
 def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
     """Return the return heat index (RHI), 1 - SHI, dimensionless (Sharma, Bash and Patel 2002).
 
-    Args:
-        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
-        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
-        airflow_m3s: Sum of the airflow of the racks, m3/s.
+    Arguments are as in ``shi``.
     """
     return as_array(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s, airflow_m3s))
 
@@ -124,13 +121,7 @@ def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values
 def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
     """Return the flow-weighted rise through the racks, sum V*(T_out - T_in) / sum V, in K.
 
-    Args:
-        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
-        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
-        airflow_m3s: Sum of the airflow of the racks, m3/s.
-
-    Returns:
-        Temperature rise, K, and 0 without airflow.
+    It is 0 without airflow. Arguments are as in ``shi``.
     """
     return _ratio(np.subtract(outlet_rise_m3k_s, inlet_rise_m3k_s), airflow_m3s, _NO_AIRFLOW_M3S)
 

@@ -212,12 +212,8 @@ def _place_tiles_and_returns(
 ) -> tuple[tuple[I32, F64], tuple[I32, F64]]:
     """Add supply and return air to ``boundary`` and return cells and flows, in m3/s, of both.
 
-    Args:
-        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); changed in place.
-        cuts: Cells of the hall.
-        hall: Configuration of the hall.
-        airflow_m3s: Airflow of each rack, m3/s, (R,).
-        supply_m3s: Total airflow of the floor tiles, m3/s.
+    ``supply_m3s`` is the total airflow of the floor tiles; other arguments are as in
+    ``_place_racks``.
     """
     x, y, z = cuts.widths_m
     number, aisle_of_y = cuts.number, cuts.aisle_of_y

@@ -208,14 +208,8 @@ class EntropicActors(Actors[Values]):
     """Stochastic policies with an entropy bonus.
 
     The weight of the entropy is the temperature. Each learner has a temperature, which is adjusted
-    until the entropy of the learner's policy equals a target (Haarnoja et al. 2018).
-
-    Args:
-        critic: critic that the policies learn from.
-        spaces: sizes of the observations and actions of each learner.
-        settings: settings of the algorithm.
-        rewards: number of rewards that the critic values, Z.
-        generator: random generator of the initial weights.
+    until the entropy of the learner's policy equals a target (Haarnoja et al. 2018). Arguments are
+    as in ``Actors``.
     """
 
     def __init__(

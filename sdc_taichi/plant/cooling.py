@@ -60,15 +60,7 @@ def accelerating_setpoint(
     From the fourth equal command in a row on, the change grows by one step per command. Lowering
     the setpoint is never amplified, because the released code compares the index of the action
     with the change that the action stands for. Repeated zero commands count but move nothing.
-
-    Args:
-        setpoint_c: Present setpoint, C, (B,).
-        command: Number of steps to move, (B,).
-        run: Number of equal commands in a row so far, (B,).
-        last: Command of the previous step, (B,).
-        step_k: Size of a step, K, (B,).
-        low_c: Lowest setpoint, C, (B,).
-        high_c: Highest setpoint, C, (B,).
+    Arguments are as in ``symmetric_setpoint``.
 
     Returns:
         The new setpoint, in C, the number of equal commands in a row, and the command, each (B,).
