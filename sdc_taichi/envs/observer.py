@@ -75,7 +75,7 @@ class Observer:
         slots: Mapping[str, UnitSlots] | None = None,
     ) -> None:
         agents, leads = options.agents, (options.ci_leads_h, options.weather_leads_h)
-        commands = {agent: options.commands_of(agent) for agent in agents}
+        commands: dict[str, tuple[str, ...]] = {a: options.commands_of(a) for a in agents}
         forecasts = Forecasts(fleet.steps_per_hour, *leads)
         units = np.diff(fleet.unit_offsets)
         self._equal_units = bool(np.all(units == units[0]))
@@ -126,7 +126,9 @@ class Observer:
         self._in_observation = {a: _entries_of_units(self.features[a], slices) for a in of_units}
         self._unit_slices = {axis: feature_slices(x) for axis, x in self._of_units.items()}
         # Measured entries first receive an arbitrary time entry, which ``observe`` overwrites.
-        from_rows = {a: np.where(c < self._time_width, c, 0) for a, c in columns.items()}
+        from_rows: dict[str, I64] = {
+            a: np.where(c < self._time_width, c, 0) for a, c in columns.items()
+        }
         self._runs = {agent: _runs(c - self._time_width) for agent, c in columns.items()}
         self._time = TimeRows(
             of_time,
