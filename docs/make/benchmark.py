@@ -5,8 +5,8 @@
 reads the results of whole suites. It writes a table and a picture of each suite between the lines
 ``<!-- SUITE -->`` and ``<!-- end -->`` of DOCS/benchmark.md, all tables into DOCS/benchmark/, and
 figures of some rows in one week into CELLS/SUITE, which tests/test_published.py computes again.
-The page has one line for all rows that share a place. Results that are not whole, of a quick form,
-or of several states of the source are refused.
+The page shows the last case with perfect forecasts, with one line for all rows that share a place.
+Results that are not whole, of a quick form, or of several states of the source are refused.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def publish(folders: Sequence[Path], docs: Path, cells: Path) -> None:
         for name, table in tables.items():
             text = table.to_csv(index=False, lineterminator="\n", float_format="%.6g")
             write(docs / "benchmark" / f"{suite.name}-{name}.csv", text.encode())
-        board = list(boards.values())[-1]
+        cases = suite.suite.cases
+        board = [boards[name] for name in boards if not cases[name].forecast_error][-1]
         parts = section(suite, board, tables, docs)
         text = page.read_text("utf-8")
         place = re.search(rf"(?s)(?<=<!-- {suite.name} -->\n).*?(?=<!-- end -->)", text)
@@ -173,7 +174,7 @@ def command_of(text: str) -> str:
         if name in _ELSEWHERE:
             if not is_joined:
                 next(words, None)
-        elif word not in ("--resume", "--quiet"):
+        elif word not in ("run", "--resume", "--quiet"):
             shown.append(word)
     return shlex.join(shown)
 
