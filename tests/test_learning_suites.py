@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from collections.abc import Sequence
@@ -13,17 +14,20 @@ import pytest
 import yaml
 
 from sdc_taichi import build_fleet, make_controller
-from sdc_taichi.benchmark.cases import data_centers
+from sdc_taichi.benchmark.cases import data_centers, training_settings
 from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, run_job
 from sdc_taichi.benchmark.leaderboard import leaderboard
 from sdc_taichi.benchmark.store import ResultStore
-from sdc_taichi.benchmark.suite import Suite, make_suite
+from sdc_taichi.benchmark.suite import Suite, load_suite, make_suite, suite_names
 from sdc_taichi.benchmark.suite_results import read_suites
 from sdc_taichi.benchmark.suite_run import row_jobs, run_suite, study_of
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
+from sdc_taichi.learning.training_settings import TrainingSettings
 
 pytest.importorskip("torch", reason="torch is not installed: make test-train")
+
+from sdc_taichi.learning.trainer import make_algorithm, make_env, make_stream
 
 CASE = {
     "config": "tiny",
@@ -143,3 +147,25 @@ def test_policies_run_in_cases_in_which_they_were_not_trained(tmp_path: Path) ->
         controller = make_controller(f"policy:{policy}", weeks.sim.fleet)
         again = evaluate(weeks, [Contender("again", controller)], beside=False).rows
     assert again["figure"].tolist() == rows["figure"]["away"].tolist()[:1]
+
+
+def off_policy_trainings(name: str) -> list[TrainingSettings]:
+    chosen = load_suite(name, quick=True)
+    return [
+        training_settings(
+            case, row, objective=str(chosen.objective), seed=0, training=chosen.training
+        )
+        for of_case, case in chosen.cases.items()
+        for of_row, row in chosen.rows.items()
+        if case.trained_in is None and chosen.is_for(of_row, of_case)
+        if (row.train or {}).get("algorithm") in ("had3qn", "hasac")
+    ]
+
+
+@pytest.mark.parametrize("name", [x for x in suite_names() if off_policy_trainings(x)])
+def test_critics_of_joint_actions_fit_the_agents_of_a_suite(name: str) -> None:
+    for settings in off_policy_trainings(name):
+        with contextlib.closing(make_env(settings)) as env:
+            make_algorithm(
+                settings.algorithm, settings.learning, make_stream(settings, env), updates=1, seed=0
+            )
