@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 from collections.abc import Sequence
@@ -27,7 +26,7 @@ from sdc_taichi.learning.training_settings import TrainingSettings
 
 pytest.importorskip("torch", reason="torch is not installed: make test-train")
 
-from sdc_taichi.learning.trainer import make_algorithm, make_env, make_stream
+from sdc_taichi.learning.trainer import train
 
 CASE = {
     "config": "tiny",
@@ -149,23 +148,24 @@ def test_policies_run_in_cases_in_which_they_were_not_trained(tmp_path: Path) ->
     assert again["figure"].tolist() == rows["figure"]["away"].tolist()[:1]
 
 
-def off_policy_trainings(name: str) -> list[TrainingSettings]:
+def quick_trainings(name: str) -> list[TrainingSettings]:
     chosen = load_suite(name, quick=True)
     return [
         training_settings(
-            case, row, objective=str(chosen.objective), seed=0, training=chosen.training
+            case.model_copy(update={"optimum": False}),
+            row,
+            objective=str(chosen.objective),
+            seed=0,
+            training=chosen.training,
         )
         for of_case, case in chosen.cases.items()
         for of_row, row in chosen.rows.items()
         if case.trained_in is None and chosen.is_for(of_row, of_case)
-        if (row.train or {}).get("algorithm") in ("had3qn", "hasac")
+        if row.train is not None
     ]
 
 
-@pytest.mark.parametrize("name", [x for x in suite_names() if off_policy_trainings(x)])
-def test_critics_of_joint_actions_fit_the_agents_of_a_suite(name: str) -> None:
-    for settings in off_policy_trainings(name):
-        with contextlib.closing(make_env(settings)) as env:
-            make_algorithm(
-                settings.algorithm, settings.learning, make_stream(settings, env), updates=1, seed=0
-            )
+@pytest.mark.parametrize("name", [x for x in suite_names() if quick_trainings(x)])
+def test_trainings_of_a_quick_suite_can_begin(name: str, tmp_path: Path) -> None:
+    for at, settings in enumerate(quick_trainings(name)):
+        assert train(settings, tmp_path / str(at), stop=lambda: True).steps == 0
