@@ -52,7 +52,8 @@ OPTIONS: dict[str, bool | int] = {
 
 Without ``fast_math``, a sum has the same bits in every kernel. Without ``real_matrix_scalarize``,
 Taichi loads, stores and computes a vector as one SIMD vector. At ``opt_level`` 0 Taichi does not
-search the whole kernel for common subexpressions. LLVM finds them too, in a third of the time."""
+search the whole kernel for common subexpressions, which takes half the time of compilation; LLVM
+finds them anyway."""
 
 _compiling = threading.RLock()
 """Lock for changes of compiler options, which belong to the runtime of the whole process."""

@@ -114,8 +114,7 @@ def percentile_interval(value: float, drawn: F64) -> Interval:
         value: statistic of the samples without resampling.
         drawn: values of the bootstrap resamples, (draws,).
     """
-    tail = 50.0 * (1.0 - 0.95)
-    low, high = np.percentile(drawn, [tail, 100.0 - tail])
+    low, high = np.percentile(drawn, [2.5, 97.5])
     return Interval(value, float(low), float(high))
 
 
